@@ -127,7 +127,7 @@ def test_the_held_seconds_are_listed(robot: RunningRobot) -> None:
     said = robot.commands["list"]({})
     assert said["type"] == "said"
     assert said["text"] == "Listing the held seconds, each frame ..."
-    until(lambda: robot._listing is not None and not robot._listing.is_alive())
+    until(lambda: not robot._listing.jobs[-1].going)
     groups = robot.findings.content()
     assert {frame.frame for _, _, frames in groups for frame in frames} >= {FIRST, FIRST + FRAMES - 1}
 

@@ -31,7 +31,7 @@ from bevviz.recording import entities
 from bevviz.why import Selection
 from bevviz.workbench.live_buffer import WHOLE, LiveBuffer
 from bevviz.workbench.running_robot import KEPT, RunningRobot, robot_session
-from bevviz.workbench.server import PageServer
+from bevviz.workbench.server import page_server
 from bevviz.workbench.session import WorkbenchSession
 from tests.support import kept_drives
 from tests.support.live_sessions import live_bench, run_beside
@@ -332,7 +332,7 @@ def test_a_browser_shows_begin_and_end_of_a_problem(
             live.problems.set("silent", "/camera", "")
             until(lambda: not rows.count(), "its end")
 
-    with PageServer(lambda: session, "live", None, addresses.append):
+    with page_server(lambda: session, "live", None, addresses.append):
         run_beside(live, look)
 
 

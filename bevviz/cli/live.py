@@ -312,7 +312,7 @@ def _page(workbench: int | None, live: Live) -> AbstractContextManager[object]:
         return nullcontext()
     try:
         from bevviz.workbench.running_robot import robot_session
-        from bevviz.workbench.server import PageServer
+        from bevviz.workbench.server import page_server
     except ImportError as error:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
@@ -322,7 +322,7 @@ def _page(workbench: int | None, live: Live) -> AbstractContextManager[object]:
     def ready(address: str) -> None:
         say(f"workbench at {address}", always=True)
 
-    return PageServer(lambda: session, "live", workbench or None, ready)
+    return page_server(lambda: session, "live", workbench or None, ready)
 
 
 def _files(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:

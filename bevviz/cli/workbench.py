@@ -89,13 +89,14 @@ def open_page(
         opened: called once a page shows the first frame, before the run.
     """
     try:
-        from bevviz.workbench.server import serve
-        from bevviz.workbench.startup import LabelledSource
+        from bevviz.workbench.labelled_source import LabelledSource
+        from bevviz.workbench.server import page_server
     except ImportError as error:
         raise UserError(
             f"the workbench needs further packages ({error.name}): pip install 'bevviz[workbench]'"
         ) from None
     from bevviz.bags.remote import beside
+    from bevviz.support.freed_memory import return_freed_memory
 
     paths, truth, page = options.drive.paths, options.truth, options.page
     at, number = options.frame.at, options.frame.at_frame or 0
@@ -121,7 +122,9 @@ def open_page(
 
         with suppress(KeyboardInterrupt), interruptible():  # The user ends it with a signal.
             drive = "\n".join(str(beside(path)) for path in paths)
-            serve(make, drive, page.port, ready)
+            return_freed_memory()
+            with page_server(make, "page", page.port, ready, drive) as server:
+                server.join()
     return 0
 
 

@@ -9,6 +9,9 @@ from typing import Annotated, Generic, TypeVar
 
 from bevviz.errors import UserError, first_line
 from bevviz.support.json_form import LEFT_OUT, message_form
+from bevviz.support.loggers import logger
+
+_log = logger(__name__)
 
 
 @message_form
@@ -106,6 +109,8 @@ class Jobs(Generic[J]):
         except CancelledError:
             job.state = "cancelled"
         except Exception as error:
+            if not isinstance(error, UserError):
+                _log.error("%s failed", self._name, exc_info=error)
             job.error = str(error) if isinstance(error, UserError) else first_line(error)
             job.state = "failed"
         self._tell()

@@ -217,7 +217,6 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
             self._picture(frame)
         else:
             self.show(result, findings)
-        self.know(frame)
         self.results.add(result)
         self._forget_unplaced(frame)
         self._reached = max(self._reached, frame.stamp)

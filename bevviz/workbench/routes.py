@@ -6,9 +6,9 @@ import asyncio
 import contextlib
 import secrets
 from collections.abc import Container
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -22,7 +22,9 @@ from bevviz.support.colors import css_properties
 from bevviz.workbench.access import SHARED, Guard, cookie_name
 from bevviz.workbench.buffers import PageState
 from bevviz.workbench.page_connection import PageConnection, news_event
-from bevviz.workbench.startup import SessionStartup
+
+if TYPE_CHECKING:
+    from bevviz.workbench.session import WorkbenchSession
 
 Kind = Literal["page", "live"]  # page of a drive, page of a running robot
 
@@ -42,7 +44,7 @@ class Site:
     """Request handlers of the page.
 
     Args:
-        startup: start-up of the workbench session.
+        session: the workbench session, once it is made.
         viewer: folder of the viewer's files.
         version: version of the viewer.
         token: token that every request has to carry.
@@ -51,9 +53,9 @@ class Site:
     """
 
     def __init__(
-        self, startup: SessionStartup, viewer: Path, version: str, token: str, port: int, kind: Kind
+        self, session: Future[WorkbenchSession], viewer: Path, version: str, token: str, port: int, kind: Kind
     ) -> None:
-        self._startup, self._viewer, self._version, self._kind = startup, viewer, version, kind
+        self._session, self._viewer, self._version, self._kind = session, viewer, version, kind
         self._token, self._port = token, port
         self._run = secrets.token_hex(4)  # A page that reconnects to another run reloads.
         self._questions = ThreadPoolExecutor(1, "questions")  # One thread answers all questions in turn.
@@ -72,6 +74,12 @@ class Site:
             WebSocketRoute("/talk", self.talk),
         ]
         return Guard(Starlette(routes=routes), self._token, self._port)
+
+    async def _workbench(self) -> WorkbenchSession | None:
+        """Wait until the session is made, and return it. None: it could not be made."""
+        with contextlib.suppress(Exception):
+            return await asyncio.wrap_future(self._session)
+        return None
 
     # --- files ---------------------------------------------------------------------------------
 
@@ -112,7 +120,7 @@ class Site:
         """Return the configuration with the tried settings as a YAML file."""
         from bevviz.config import changed_config, config_yaml
 
-        workbench = await self._startup.session()
+        workbench = await self._workbench()
         if workbench is None:
             return PlainTextResponse("the drive cannot be opened\n", 503)
         try:
@@ -125,7 +133,7 @@ class Site:
 
     async def report(self, request: Request) -> Response:
         """Return a file of a report that this server made."""
-        workbench, number = await self._startup.session(), request.path_params["number"]
+        workbench, number = await self._workbench(), request.path_params["number"]
         try:
             reports = [] if workbench is None else workbench.reports.jobs
         except UserError:  # the page of an artificial robot
@@ -139,7 +147,7 @@ class Site:
 
     async def thumbnail(self, request: Request) -> Response:
         """Return a small image of the camera near a frame."""
-        workbench = await self._startup.session()
+        workbench = await self._workbench()
         picture = None if workbench is None else workbench.source.thumbnail(request.path_params["number"])
         if picture is None:
             return PlainTextResponse("there is no image of this frame yet\n", 404)
@@ -154,7 +162,7 @@ class Site:
         is a stamp instead, the frame of that stamp is sent next.
         """
         await socket.accept()
-        workbench = await self._startup.session()
+        workbench = await self._workbench()
         if workbench is None:
             await socket.close()
             return
@@ -188,10 +196,9 @@ class Site:
         """Answer the questions of a page, and send it the progress of the run."""
         await socket.accept()
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
-            workbench = await self._startup.session()
+            workbench = await self._workbench()
             if workbench is None:
-                error = self._startup.error
-                await socket.send_json({"type": "failed", "text": str(error)})
+                await socket.send_json({"type": "failed", "text": str(self._session.exception())})
                 return
             await PageConnection(workbench, socket, self._questions, self._run).stay()
 

@@ -6,12 +6,12 @@ The results of the newest frames are in memory. Earlier ones are made again from
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +32,7 @@ from bevviz.why.robot_questions import RobotQuestions
 from bevviz.workbench.buffers import PageState, Reader
 from bevviz.workbench.growing_drive import GrowingDrive, RunProgress, Settings
 from bevviz.workbench.held_seconds import FrameFacts, HeldSeconds
+from bevviz.workbench.jobs import Job, Jobs
 from bevviz.workbench.live_buffer import LiveBuffer
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.piece_logger import PieceLogger
@@ -81,8 +82,7 @@ class RunningRobot(GrowingDrive):
         self._start = 0  # first stamp of the held seconds; frames that are kept from earlier do not count
         self._bags: deque[HeldSeconds] = deque()  # guarded by _reading
         self._whole: set[int] = set()  # frames that pages got again, with all points
-        self._listing: threading.Thread | None = None
-        self._stop = threading.Event()  # ends the listing
+        self._listing: Jobs[Job] = Jobs("list", self.news.tell)
         self._settings: Settings = ()  # settings that pages have changed
         encoder = live.encoder
         self._marker = PieceLogger(encoder.application, encoder.recording_id, live.config, live.scene)
@@ -91,7 +91,7 @@ class RunningRobot(GrowingDrive):
 
     def close(self) -> None:
         """Close the buffer of the pages, and delete the bags."""
-        self._end_list()
+        self._listing.end()
         self.recording.close()
         with self._reading:
             while self._bags:
@@ -201,7 +201,7 @@ class RunningRobot(GrowingDrive):
         Raises:
             UserError: no frame has come yet, or it cannot be made again.
         """
-        self._end_list()
+        self._listing.end()
         shown, oldest = self._shown_at(stamp)
         number = oldest if shown is None else shown
         self._show_again(number)
@@ -356,37 +356,25 @@ class RunningRobot(GrowingDrive):
 
     def _list(self, message: ListHeld) -> Said:
         """Begin to list the findings of the held seconds, frame by frame, at the lowest priority."""
-        self._end_list()
+        self._listing.end()
         numbers = [number for _, number in self.frame_times()]
         step = -(-len(numbers) // LISTED_FRAMES)
-        self._stop = threading.Event()
-        self._listing = threading.Thread(
-            target=self._list_frames, args=(numbers[::step], self._stop), name="list", daemon=True
-        )
         self.findings.replace(LISTED)
-        self._listing.start()
+        self._listing.start(Job(0), partial(self._list_frames, numbers[::step]))
         every = "frame" if step == 1 else f"{step} frames"
         return {"type": "said", "text": f"Listing the held seconds, each {every} ..."}
 
-    def _list_frames(self, numbers: Sequence[int], stop: threading.Event) -> None:
+    def _list_frames(self, numbers: Sequence[int], job: Job) -> None:
         give_way()
         for number in numbers:
             start = time.monotonic()
             with suppress(UserError):  # The frame is gone meanwhile.
                 findings = find_findings(self.explainer(self.look(number)))
-                if stop.is_set():
-                    return
+                job.check()
                 self.findings.add(findings)
                 self.news.tell()
-            if stop.wait(time.monotonic() - start):  # The run gets at least half of the time.
-                return
-
-    def _end_list(self) -> None:
-        """End the listing."""
-        self._stop.set()
-        if self._listing is not None:
-            self._listing.join()
-            self._listing = None
+            job.stop.wait(time.monotonic() - start)  # The run gets at least half of the time.
+            job.check()
 
     def _snap(self, message: Snap) -> Said:
         """Save the flight recorder."""

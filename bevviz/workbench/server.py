@@ -6,8 +6,9 @@ import importlib.util
 import secrets
 import socket
 import threading
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,11 +16,8 @@ from typing import TYPE_CHECKING
 import uvicorn
 
 from bevviz.errors import UserError
-from bevviz.support.contexts import Closable
-from bevviz.support.freed_memory import return_freed_memory
 from bevviz.workbench.access import HOSTS, persistent_token
 from bevviz.workbench.routes import VIEWER, Kind, Site
-from bevviz.workbench.startup import SessionStartup
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp
@@ -30,86 +28,68 @@ PORT = 9880  # The default is fixed, because browsers cache the compiled viewer 
 PATIENCE = 3.0  # seconds to wait for the thread of the server
 
 
-def serve(
-    make: Callable[[], WorkbenchSession], drive: str, port: int | None, ready: Callable[[str], None]
-) -> None:
-    """Serve the page of a drive until an interrupt, see ``PageServer``.
-
-    Args:
-        make: makes the workbench session.
-        drive: paths of the drive. A page reconnects after a crash if the server of the same drive starts
-            again.
-        port: port of the page.
-        ready: called with the address.
-
-    Raises:
-        UserError: as ``PageServer``, or ``make`` raises one.
-    """
-    return_freed_memory()
-    with PageServer(make, "page", port, ready, drive) as server:
-        server.wait()
-
-
-class PageServer(Closable):
-    """Server of a page, in a thread of its own, until it is closed.
+@contextmanager
+def page_server(
+    make: Callable[[], WorkbenchSession],
+    kind: Kind,
+    port: int | None,
+    ready: Callable[[str], None],
+    drive: str = "",
+) -> Iterator[threading.Thread]:
+    """Serve a page until the context ends. Yield the thread of the server, which an error of ``make`` ends.
 
     Args:
         make: makes the workbench session in a further thread, while the page loads its viewer.
         kind: kind of page.
         port: port of the page. None: 9880, or a free one if that is in use.
         ready: called with the address of the page once it can be opened, before the session is made.
-        drive: paths of the drive, whose token survives a crash. None: each server has a new token.
+        drive: paths of the drive. A page reconnects after a crash if the server of the same drive starts
+            again. Empty: it does not.
 
     Raises:
-        UserError: the port is in use, or the viewer is not installed.
+        UserError: the port is in use, the viewer is not installed, or ``make`` raises one.
     """
+    viewer, reachable = viewer_folder(), threading.Event()
+    session: Future[WorkbenchSession] = Future()
+    session.set_running_or_notify_cancel()  # A page that no longer waits for it does not cancel it.
 
-    def __init__(
-        self,
-        make: Callable[[], WorkbenchSession],
-        kind: Kind,
-        port: int | None,
-        ready: Callable[[str], None],
-        drive: str | None = None,
-    ) -> None:
-        viewer, reachable = viewer_folder(), threading.Event()
-        with ExitStack() as stack:
-            listening = stack.enter_context(bound_socket(port))
-            port = listening.getsockname()[1]
-            token = secrets.token_urlsafe(16)
-            if drive is not None:
-                token = stack.enter_context(persistent_token(port, drive))
-            self._startup = stack.enter_context(SessionStartup(make, lambda: self._server.end()))
-            site = Site(self._startup, viewer, version("rerun-sdk"), token, port, kind)
-            self._server = Server(site.application(), reachable.set)
-            self._thread = threading.Thread(
-                target=self._server.run, kwargs={"sockets": [listening]}, name="page", daemon=True
-            )
-            self._thread.start()
-            stack.callback(self._end)
+    def open_session() -> None:
+        try:
+            workbench = make()
+            workbench.start()
+        except BaseException as error:
+            session.set_exception(error)
+            server.end()
+        else:
+            session.set_result(workbench)
+
+    with bound_socket(port) as listening, _token(listening.getsockname()[1], drive) as token:
+        port = listening.getsockname()[1]
+        site = Site(session, viewer, version("rerun-sdk"), token, port, kind)
+        server = Server(site.application(), reachable.set)
+        thread = threading.Thread(target=server.run, args=([listening],), name="page", daemon=True)
+        thread.start()
+        try:
             reachable.wait(PATIENCE)
             ready(f"http://{HOSTS[0]}:{port}/?token={token}")
-            self._startup.start()
-            self._stack = stack.pop_all()
+            threading.Thread(target=open_session, name="opening", daemon=True).start()
+            yield thread
+        finally:
+            server.end()
+            thread.join(PATIENCE)
+            session.add_done_callback(_close)  # now, or as soon as it is made
+        if session.done():
+            session.result()
 
-    def wait(self) -> None:
-        """Wait until the server ends.
 
-        Raises:
-            BaseException: that of ``make``, which ends the server.
-        """
-        self._thread.join()
-        if self._startup.error is not None:
-            raise self._startup.error
+def _close(session: Future[WorkbenchSession]) -> None:
+    """Close a session, if it could be made."""
+    if session.exception() is None:
+        session.result().close()
 
-    def close(self) -> None:
-        """Stop the server, then close the workbench session."""
-        self._stack.close()
 
-    def _end(self) -> None:
-        """Stop the server."""
-        self._server.end()
-        self._thread.join(PATIENCE)
+def _token(port: int, drive: str) -> AbstractContextManager[str]:
+    return persistent_token(port, drive) if drive else nullcontext(secrets.token_urlsafe(16))
 
 
 def bound_socket(port: int | None) -> socket.socket:

@@ -78,9 +78,9 @@ def serving(*arguments: str, model: str = "demo") -> Iterator[tuple[str, subproc
 def served(bag: Path, *settings: str) -> Iterator[str]:
     """Serve the workbench of a bag from a thread of this process. Yield its address."""
     pytest.importorskip("starlette", reason="needs pip install 'bevviz[workbench]'")
-    from bevviz.workbench.server import PageServer
+    from bevviz.workbench.labelled_source import LabelledSource
+    from bevviz.workbench.server import page_server
     from bevviz.workbench.session import recorded_session
-    from bevviz.workbench.startup import LabelledSource
 
     config = load(None, ["detector.model=demo", *settings])
     with LabelledSource([bag], config) as source, LabelledSource([bag], config) as again:
@@ -89,7 +89,7 @@ def served(bag: Path, *settings: str) -> Iterator[str]:
             return recorded_session(Drive(source, config), again, [bag])
 
         addresses = list[str]()
-        with PageServer(make, "page", 0, addresses.append, str(bag)):
+        with page_server(make, "page", 0, addresses.append, str(bag)):
             yield addresses[0]
 
 

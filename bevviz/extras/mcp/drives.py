@@ -30,8 +30,8 @@ from bevviz.model.results import FrameResult
 from bevviz.pipeline.run import run
 from bevviz.pipeline.session import Session
 from bevviz.recording.source_lookup import find_source
+from bevviz.workbench.labelled_source import LabelledSource
 from bevviz.workbench.session import WorkbenchSession, recorded_session
-from bevviz.workbench.startup import LabelledSource
 
 
 @dataclass
