@@ -24,7 +24,6 @@ from bevviz.recording.writer import SCALAR_WAIT
 from bevviz.support.contexts import Closable
 from bevviz.why import FrameExplainer
 from bevviz.workbench.buffers import RecordingBuffer
-from bevviz.workbench.growing_drive import Settings
 from bevviz.workbench.piece_logger import PieceLogger
 
 WHOLE = 400_000_000  # bytes of a recording that a browser holds as a whole
@@ -170,7 +169,7 @@ class DriveRecording(Closable):
         self,
         logger: PieceLogger,
         explainer: FrameExplainer,
-        settings: Settings,
+        settings: tuple[str, ...],
         known: frozenset[str] = frozenset(),
     ) -> None:
         """Log a frame with these settings beside the result of the run. Clear what is ``known`` of others."""
@@ -183,7 +182,7 @@ class DriveRecording(Closable):
             self._recoloured.add(number)
         self._log(logger, result, find_findings(explainer), settings, cloud=number in self._recoloured)
 
-    def entity_rows(self, number: int, settings: Settings) -> EntityRows | None:
+    def entity_rows(self, number: int, settings: tuple[str, ...]) -> EntityRows | None:
         """Return the rows behind the entities of a frame as drawn. None: they are not kept.
 
         Over the input of the sensors, a frame with other values shows the frame as opened.
@@ -199,7 +198,7 @@ class DriveRecording(Closable):
         logger: PieceLogger,
         result: FrameResult,
         findings: Sequence[Finding],
-        settings: Settings,
+        settings: tuple[str, ...],
         *,
         cloud: bool = False,
     ) -> None:
