@@ -14,10 +14,11 @@ import pytest
 import bevviz
 from bevviz.anomalies import AnomalyDetector
 from bevviz.anomalies.calibration_drift import LEAST_PAST, PlacementWatch, find_error, score_rotations
+from bevviz.anomalies.mounting_changes import MountingWatch
 from bevviz.anomalies.sensor_faults import ImageWatch
 from bevviz.anomalies.sensors import SensorWatch
 from bevviz.config import AnomaliesConfig
-from bevviz.model.frame import Image
+from bevviz.model.frame import Camera, Image, Intrinsics
 from bevviz.model.results import Anomaly, FrameResult
 from tests.support.sensor_plants import (
     Results,
@@ -273,3 +274,34 @@ def test_image_and_cloud_of_different_places_tell_no_error(shared: Path) -> None
     known = [scores for scores in checks if scores is not None]
     for count in range(LEAST_PAST, len(known) + 1):
         assert find_error(np.array(known[:count])) is None
+
+
+@pytest.mark.parametrize(
+    ("behind", "amplitude"), [(0.3, 12.0), (-0.25, 12.0), (0.0, 12.0), (0.1, 12.0), (0.3, 1.0)]
+)
+def test_a_clock_that_is_off_is_told_by_the_turns(drive: Results, behind: float, amplitude: float) -> None:
+    """The camera looks around in a real image, and its stamps are behind those of the scans."""
+    focal, wide = 300.0, pixels(drive[0])
+    optical = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    K = np.array([[focal, 0, 160], [0, focal, 120], [0, 0, 1]])
+    watch, told = MountingWatch("front", "top"), set[str]()
+    for i in range(60):
+        yaw, before, seen = (amplitude * np.sin(0.2 * (i + steps)) for steps in (0, -1, 10 * behind))
+        column = wide.shape[1] / 2 - 160 - focal * float(np.tan(np.radians(seen)))
+        view = cv2.getRectSubPix(wide, (320, 240), (column + 160, 180.0))
+        image = Image((i + 1) * 100_000_000, "front", np.asarray(view, np.uint8), topic="/front/image_raw")
+        camera = Camera("front", image, Intrinsics(320, 240, K), optical, None)
+        gray = np.asarray(cv2.cvtColor(image.bgr, cv2.COLOR_BGR2GRAY), np.uint8)
+        scene = np.array([0.0, 0.0, before - yaw])
+        told |= {
+            f"{fault.name}{fault.detail}" for fault in watch.update(camera, gray, scene, image.stamp, True)
+        }
+    if abs(behind) < 0.2 or amplitude < 5:
+        assert not told
+        return
+    (text,) = told
+    side = "behind" if behind > 0 else "ahead of"
+    assert text == (
+        f"clock is off, {abs(behind):.2f} s {side} LiDAR top by the turns of the drive; "
+        f"--set sync.offsets='{{/front/image_raw: {behind:.2f}}}' sets it right"
+    )

@@ -1,9 +1,10 @@
 """Faults of mountings: a camera or LiDAR that turned, and a transform between them that jumped.
 
 Camera and LiDAR see the same rotation of the robot. A rotation that only one of them sees, for one frame, is
-a sensor that was turned. The rotation of a camera comes from corners that are tracked from image to image
-(Shi and Tomasi 1994; Bouguet 2000). The rotation of a LiDAR comes from the mean range in each direction, and
-from the slope of the ground.
+a sensor that was turned. A rotation that the camera sees earlier or later than the LiDAR, always by the same
+time, is a camera whose clock is off. The rotation of a camera comes from corners that are tracked from image
+to image (Shi and Tomasi 1994; Bouguet 2000). The rotation of a LiDAR comes from the mean range in each
+direction, and from the slope of the ground.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import cv2
 import numpy as np
 
 from bevviz.anomalies.sensor_faults import SensorFault
-from bevviz.model.frame import F32, F64, I64, U8, Camera
+from bevviz.model.frame import F32, F64, I64, U8, Camera, Image
 from bevviz.model.results import Ground, Voxels
 from bevviz.support.numba_kernel import kernel
 
@@ -44,6 +45,14 @@ STEADY = 0.6  # degrees, largest such rotation in the frames before and after it
 STEP, SHIFT = 0.5, 0.05  # degrees and metres, least jump of a transform
 JERK = 4.0  # ratio of a jump to the usual change of a camera that is moved on purpose
 LASTS = 30.0  # seconds for which it is told
+
+COMPARED, FEW_COMPARED = 100, 25  # rotations that tell how far a clock is off
+JUDGE = 10  # rotations from one judgement of the clock to the next
+OFFSETS = np.arange(-1.0, 1.01, 0.05)  # seconds that are tried
+LEAST_OFFSET = 0.2  # seconds; a scan may be stamped at its start or end, and lasts 0.1 s
+TURNS = 4.0  # degrees per second, least spread of the rotation of a drive that tells
+CORRELATED = 0.97  # least correlation of the rotations at the best offset
+CLEARER = 4.0  # ratio of the unexplained rotation without an offset to that at the best
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,8 +192,35 @@ def camera_rotation(before: U8, after: U8, camera: Camera) -> F64 | None:
     return np.degrees([-down, right, np.arctan2(motion[1, 0], motion[0, 0])])
 
 
+def stamp_offset(camera: F64, lidar: F64) -> float | None:
+    """Return the seconds that a camera's stamps lack, by its rotation and that of the LiDAR.
+
+    Args:
+        camera: (N, 2) time in seconds and rotation in degrees per second, which rises in time.
+        lidar: (N, 2) the same of the LiDAR about the same axis.
+
+    Returns:
+        None: the stamps are right, or the drive does not turn enough to tell.
+    """
+    if len(camera) < FEW_COMPARED or np.std(lidar[:, 1]) < TURNS or np.std(camera[:, 1]) < TURNS:
+        return None
+    correlation = np.zeros(len(OFFSETS))
+    for k, offset in enumerate(OFFSETS):
+        time = camera[:, 0] + offset
+        inside = (time >= lidar[0, 0]) & (time <= lidar[-1, 0])
+        seen, turned = camera[inside, 1], np.interp(time[inside], *lidar.T)
+        if len(seen) >= FEW_COMPARED // 2 and min(np.std(seen), np.std(turned)) > TURNS / 2:
+            correlation[k] = np.corrcoef(seen, turned)[0, 1]
+    best = int(correlation.argmax())
+    offset, unexplained = float(OFFSETS[best]), 1 - correlation**2
+    stated = float(np.interp(0.0, OFFSETS, unexplained))
+    if not 0 < best < len(OFFSETS) - 1 or abs(offset) < LEAST_OFFSET - 1e-6:
+        return None
+    return offset if correlation[best] > CORRELATED and stated > CLEARER * unexplained[best] else None
+
+
 class MountingWatch:
-    """Detector of a camera or LiDAR that turned, and of a transform between them that jumped."""
+    """Detector of a camera or LiDAR that turned, of its clock, and of a transform that jumped."""
 
     def __init__(self, camera: str, lidar: str) -> None:
         self._camera, self._lidar = f"camera {camera}", f"LiDAR {lidar}"
@@ -195,6 +231,11 @@ class MountingWatch:
         self._mounting: F64 | None = None
         self._steps: deque[float] = deque(maxlen=PAST)  # degrees by which the transform changed
         self._before_jump: tuple[F64, int] | None = None
+        self._scan_stamp = 0
+        # Time in seconds and degrees per second about z of the points, of camera and LiDAR.
+        self._rates: deque[tuple[tuple[float, float], tuple[float, float]]] = deque(maxlen=COMPARED)
+        self._judged, self._offset = 0, 0.0
+        self._clock_fault: SensorFault | None = None
 
     def update(
         self, camera: Camera, gray: U8 | None, scene: F64 | None, stamp: int, trusted: bool
@@ -215,7 +256,14 @@ class MountingWatch:
             if self._gray is not None and gray is not None and scene is not None and mounting is not None:
                 turn = camera_rotation(self._gray, gray, camera) if trusted else None
                 self._compare(turn, mounting[:3, :3] @ scene, stamp)
+                if turn is not None:
+                    seen = _rate(self._stamp, image.stamp, float(turn @ mounting[:3, 2]))
+                    self._rates.append((seen, _rate(self._scan_stamp, stamp, float(scene[2]))))
+                    self._judge_clock(image)
             self._stamp, self._gray = image.stamp, gray if trusted else None
+        self._scan_stamp = stamp
+        if self._clock_fault is not None:
+            yield self._clock_fault
         for sensor, (angle, since) in list(self._turned.items()):
             if stamp - since > LASTS * 1e9:
                 del self._turned[sensor]
@@ -245,6 +293,24 @@ class MountingWatch:
         if np.linalg.norm(angle) >= TURNED:  # smaller: it was turned back
             self._turned[sensor] = angle, since
 
+    def _judge_clock(self, image: Image) -> None:
+        """Judge the clock of the camera now and then. Two judgements must agree."""
+        self._judged += 1
+        if self._judged % JUDGE:
+            return
+        camera, lidar = np.array(self._rates).transpose(1, 0, 2)
+        before, self._offset = self._offset, stamp_offset(camera, lidar) or 0.0
+        if not self._offset:
+            self._clock_fault = None
+        elif abs(before - self._offset) < LEAST_OFFSET / 2:
+            side = "behind" if self._offset > 0 else "ahead of"
+            detail = (
+                f", {abs(self._offset):.2f} s {side} {self._lidar} by the turns of the drive; "
+                f"--set sync.offsets='{{{image.topic}: {self._offset:.2f}}}' sets it right"
+            )
+            since = round(lidar[0, 0] * 1e9) if self._clock_fault is None else self._clock_fault.since
+            self._clock_fault = SensorFault(self._camera, "clock is off", since, detail)
+
     def _jump(self, mounting: F64 | None, stamp: int) -> Iterator[SensorFault]:
         """Yield a transform that jumped, until it is back or the new one is usual."""
         before, self._mounting = self._mounting, mounting
@@ -267,6 +333,11 @@ class MountingWatch:
         detail = f", by {degrees:.1f} degrees and {100 * metres:.0f} cm"
         name = f"transform from {self._lidar} jumped"
         yield SensorFault(self._camera, name, since, detail)
+
+
+def _rate(start: int, end: int, degrees: float) -> tuple[float, float]:
+    """Return the middle of an interval in seconds, and the degrees per second in it."""
+    return (start + end) / 2e9, degrees * 1e9 / max(end - start, 1)
 
 
 def _difference(a: F64, b: F64) -> tuple[float, float]:
