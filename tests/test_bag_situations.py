@@ -511,6 +511,24 @@ def camera_matrix(f: float, x: float, y: float, other: float = 0.0) -> F64:
             (32, 24),
             "",
         ),
+        (
+            {"k": camera_matrix(22, 32, 24), "d": np.array([-0.006, 0.04, -0.04, 0.006])},  # RealSense T265
+            22,
+            (32, 24),
+            "its coefficients of plumb_bob are of a lens 13 % off .*must be equidistant",
+        ),
+        (
+            {"k": camera_matrix(18, 32, 24), "d": np.array([-0.03, -0.01, 0.003, -0.001])},
+            18,
+            (32, 24),
+            "plumb_bob fold: they reach the columns 6 to 58 only of images of 64 x 48",
+        ),
+        (  # a webcam of 72 degrees
+            {"k": camera_matrix(44, 32, 24), "d": np.array([-0.361976, 0.110510, 0.001014, 0.000505, 0])},
+            44,
+            (32, 24),
+            "",
+        ),
     ],
 )
 def test_the_camera_matrix_is_checked_against_the_image(

@@ -24,6 +24,8 @@ from bevviz.sync.transform_tree import TransformError
 TUTORIAL_K = np.array([[267.0, 0.0, 320.0], [0.0, 267.0, 180.0], [0.0, 0.0, 1.0]])
 WIDEST, NARROWEST = 150.0, 3.0  # degrees; fields of view of lenses that are no fisheyes
 SQUARE = 1.5  # largest ratio of the two focal lengths
+FOLDED = 0.05  # share of the image beside a border, beyond which coefficients fold
+DECENTRED = 0.04  # largest tangential distortion in a corner, as share of the image's diagonal; 0.01 is usual
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,8 +263,11 @@ class Cameras:
             doubt = f"the focal lengths {fx:.0f} and {fy:.0f} are of no square pixels"
         elif intrinsics.distortion_model not in geometry.FISHEYE and not NARROWEST < view < WIDEST:
             doubt = f"the focal length {fx:.0f} gives {images} a field of view of {view:.0f} degrees"
+        helps = "" if intrinsics.doubt else ": is its K for other images?"
+        if not doubt and (what := _no_lens(intrinsics)):
+            doubt = f"its coefficients of {intrinsics.distortion_model} {what} {images}"
+            helps = ": are they those of a fisheye lens? Then distortion_model must be equidistant"
         if doubt:
-            helps = "" if intrinsics.doubt else ": is its K for other images?"
             self._report.oddities.setdefault(f"{role.topic} K", f"{role.info_topic}: {doubt}{helps}")
 
     def _fitted(
@@ -285,3 +290,23 @@ class Cameras:
         # Pixel (0, 0) is the centre of the corner pixel, so the corner itself is at -0.5.
         scale = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
         return replace(intrinsics, width=width, height=height, K=scale @ intrinsics.K)
+
+
+def _no_lens(intrinsics: Intrinsics) -> str:
+    """Return what distortion coefficients do that those of no lens do, but of a fisheye; empty: nothing."""
+    if intrinsics.distortion_model in geometry.FISHEYE or not geometry.has_distortion(intrinsics):
+        return ""
+    size = np.array([intrinsics.width, intrinsics.height])
+    corner = (size / 2 / intrinsics.K[[0, 1], [0, 1]]) ** 2
+    p1, p2 = np.abs(geometry.coefficients(intrinsics)[2:4])
+    tangential = (p1 + p2) * 3 * float(corner.sum()) * float(intrinsics.K[0, 0]) / np.linalg.norm(size)
+    if tangential > DECENTRED:
+        return f"are of a lens {100 * tangential:.0f} % off the middle of"
+    tangents = np.tan(np.radians(np.arange(-85, 85.5, 0.5)))[:, None]
+    for axis, name in ((0, "columns"), (1, "rows")):
+        rays = np.eye(3)[axis] * tangents + np.eye(3)[2]
+        reached = geometry.project(rays, intrinsics)[0][:, axis]
+        low, high = float(np.nanmin(reached)), float(np.nanmax(reached))
+        if low > FOLDED * size[axis] or high < (1 - FOLDED) * size[axis]:
+            return f"fold: they reach the {name} {max(low, 0):.0f} to {min(high, size[axis]):.0f} only of"
+    return ""
