@@ -215,6 +215,24 @@ def test_a_conflict_of_frame_and_ground_is_reported(scan: Cloud) -> None:
     assert "source.extrinsics" in text
 
 
+@pytest.mark.parametrize(("real", "stated"), [(10, 0), (0, -8), (0, 0), (-10, -10), (2, 0)])
+def test_several_scans_tell_of_a_small_tilt(scan: Cloud, real: float, stated: float) -> None:
+    sync = Synchronizer(ROLES, CONFIG)
+    by_base(sync, turned(y=stated))
+    points = geometry.apply(geometry.inverse(turned(y=real)), scan.xyz)
+    for second in range(5):
+        stamp = scan.stamp + second * 1_000_000_000
+        sync.add_cloud(replace(scan, xyz=points, topic="/points", frame_id=LIDAR, stamp=stamp))
+    assert len(list(sync.flush())) > 2
+    told = [text for text in sync.report.warnings() if "ground" in text]
+    if abs(real - stated) < 5:
+        assert not told
+        return
+    (text,) = told
+    assert f"'rslidar' sees is tilted by {abs(real - stated)} degrees in 'base_link', in 4 scans" in text
+    assert f"with a further roll of 0 and pitch of {real - stated} degrees" in text
+
+
 def test_an_unknown_mounting_is_assumed_and_reported() -> None:
     points = np.random.default_rng(0).normal(size=(2000, 3)).astype(np.float32) * 5
     sync = Synchronizer(ROLES, CONFIG)

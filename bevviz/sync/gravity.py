@@ -27,6 +27,11 @@ from bevviz.sync.transform_tree import TransformBuffer, TransformError
 TILT = math.radians(2.0)  # least tilt of a LiDAR on its robot that is corrected
 SLOPE = math.radians(8.0)  # the same without a transform to the robot: a road may be as steep
 DISAGREEMENT = math.radians(12.0)  # between transforms and ground; more means that one of them is wrong
+# The same for the mounting on the robot, by several scans: radians, scans, and seconds between two of them.
+LEVEL, LEVEL_SCANS, LEVEL_TIME = math.radians(5.0), 4, 1.0
+ALIKE = math.radians(
+    3.0
+)  # between these scans: more means that the robot swings, or that the ground is rough
 GRAVITY_TIME = 2.0  # seconds of smoothing: braking is no slope
 # Metres from the LiDAR, points and planes of the search for the ground.
 NEAR, POINTS, PLANES = 25.0, 4000, 400
@@ -75,6 +80,8 @@ class VerticalEstimate:
     _gravity: dict[str, tuple[int, F64]] = field(default_factory=dict)  # stamp and mean acceleration by frame
     _ground: dict[str, F64] = field(default_factory=dict)  # up direction by LiDAR frame, from the ground
     _tries: dict[str, int] = field(default_factory=dict)
+    # Stamp of the last scan that was compared with the robot, by LiDAR frame, and up on the robot by each.
+    _compared: dict[str, tuple[int, tuple[F64, ...]]] = field(default_factory=dict)
     # LiDAR frames that are turned; they stay so during the drive.
     _tilted: set[str] = field(default_factory=set)
 
@@ -112,11 +119,31 @@ class VerticalEstimate:
                 f"against the vertical of {source}: one of them is wrong "
                 "(source.extrinsics states transforms)"
             )
+        elif base is not None and self.checked is None:
+            self._compare(cloud, frame, base)
         if _angle(up, _Z) > (TILT if base is not None else SLOPE):
             self._tilted.add(frame)
         if frame not in self._tilted:
             return None
         return _homogeneous(base if base is not None else _least_turn(frame, up))
+
+    def _compare(self, cloud: Cloud, frame: str, base: F64) -> None:
+        """Compare a stated mounting with the ground of several scans, on which the robot stands upright."""
+        stamp, ups = self._compared.get(frame, (0, ()))
+        if len(ups) == LEVEL_SCANS or 0 <= cloud.stamp - stamp < LEVEL_TIME * 1e9:
+            return
+        ground = ground_normal(cloud.xyz)
+        ups = ups if ground is None else (*ups, base @ ground)
+        self._compared[frame] = cloud.stamp, ups
+        mean = np.sum(ups, axis=0) / max(len(ups), 1)
+        if len(ups) < LEVEL_SCANS or _angle(mean, _Z) < LEVEL or max(_angle(up, mean) for up in ups) > ALIKE:
+            return
+        roll, pitch = (round(math.degrees(math.atan2(mean[axis], mean[2]))) for axis in (1, 0))
+        self.warnings[frame] = (
+            f"the ground that LiDAR frame '{frame}' sees is tilted by {_degrees(mean, _Z):.0f} degrees in "
+            f"'{self.base_frame}', in {len(ups)} scans: its transform is wrong, and would fit with a further "
+            f"roll of {roll} and pitch of {-pitch} degrees (source.extrinsics states transforms)"
+        )
 
     def _up(self, cloud: Cloud, frame: str, fixed_frame: str) -> tuple[F64 | None, str]:
         """Return up in a LiDAR's frame, by the fixed frame or by gravity, and the name of the source."""
