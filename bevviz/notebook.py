@@ -191,9 +191,8 @@ def _place(result: FrameResult, picked: Selection | None) -> tuple[float, ...]:
         return tuple(map(float, result.objects.boxes.center[picked.row]))
     if picked.kind == "cluster" and result.clusters is not None:
         return tuple(map(float, result.clusters.centroid[picked.row]))
-    if picked.kind == "detection":
-        for camera in result.cameras:
-            if camera.camera.name == picked.camera and camera.detections is not None:
-                u0, v0, u1, v1 = map(float, camera.detections.xyxy[picked.row])
-                return (u0 + u1) / 2, (v0 + v1) / 2
+    camera = result.camera(picked.camera)
+    if picked.kind == "detection" and camera is not None and camera.detections is not None:
+        u0, v0, u1, v1 = map(float, camera.detections.xyxy[picked.row])
+        return (u0 + u1) / 2, (v0 + v1) / 2
     return ()

@@ -57,7 +57,7 @@ def finding(frame: int, row: int, x: float) -> Finding:
 def groups(listed: FindingList) -> list[list[int]]:
     """Return the frames of each group."""
     entries, _ = listed.news({})
-    return [[sight["frame"] for sight in entry["sights"]] for entry in entries]
+    return [[sight.frame for sight in entry["sights"]] for entry in entries]
 
 
 @pytest.fixture
@@ -110,7 +110,7 @@ def test_a_page_gets_each_frame_of_a_finding_once() -> None:
             entries, gone = listed.news(sent)
             assert not gone
             for entry in entries:
-                received.setdefault(entry["number"], []).extend(one["frame"] for one in entry["sights"])
+                received.setdefault(entry["number"], []).extend(one.frame for one in entry["sights"])
     assert received == {1: [*range(12)], 2: [0, 3, 6, 9]}
     assert listed.news(sent) == ([], [])
     listed.replace(["missed"])

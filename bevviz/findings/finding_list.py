@@ -7,15 +7,17 @@ import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import PlainSerializer
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from bevviz.findings.frame_findings import KINDS, Finding, Position
 from bevviz.model import geometry
 from bevviz.model.frame import F32
 from bevviz.model.reasons import ReasonKind
+from bevviz.support.json_form import message_form
 
 REACH = 2.5  # metres that an object may have moved since the last frame with this finding
 GAP = 5  # frames without the finding after which a new group begins
@@ -48,36 +50,17 @@ _EVERYTHING = ("sensor", "sync", "tf", "stage")  # anomalies that concern all ob
 _UNKNOWN = 99.0  # metres: a finding without a distance comes after the others
 
 
-class Sight(TypedDict):
-    """A ``FindingFrame`` as the page gets it. The stamp is text: JavaScript numbers cannot hold it."""
-
-    frame: int
-    stamp: str
-    distance: float | None
-    pick: str
-    tried: bool
-    text: str
-    remark: str
-    in_way: bool
+def _page_distance(distance: float) -> float | None:
+    """Return a distance as the page gets it. None: it is unknown."""
+    return None if math.isnan(distance) else round(distance, 1)
 
 
-class Entry(TypedDict):
-    """A group of findings as the page gets it, with the frames that the page does not have yet.
-
-    Lists are in the order of ``rank``. ``reasons`` say why it comes early.
-    """
-
-    number: int
-    what: str
-    name: str
-    reasons: list[str]
-    rank: tuple[float, ...]
-    sights: list[Sight]
-
-
+@message_form
 @dataclass(frozen=True, slots=True)
 class FindingFrame:
     """One frame of a finding.
+
+    The page gets the stamp as text, because JavaScript numbers cannot hold it.
 
     Attributes:
         frame: number of the scan.
@@ -91,27 +74,27 @@ class FindingFrame:
     """
 
     frame: int
-    stamp: int
-    distance: float
+    stamp: Annotated[int, PlainSerializer(str, return_type=str)]
+    distance: Annotated[float, PlainSerializer(_page_distance, return_type=float | None)]
     pick: str
     tried: bool = False
     text: str = ""
     remark: str = ""
     in_way: bool = False
 
-    @property
-    def sight(self) -> Sight:
-        """The frame as the page gets it."""
-        return {
-            "frame": self.frame,
-            "stamp": str(self.stamp),
-            "distance": None if math.isnan(self.distance) else round(self.distance, 1),
-            "pick": self.pick,
-            "tried": self.tried,
-            "text": self.text,
-            "remark": self.remark,
-            "in_way": self.in_way,
-        }
+
+class Entry(TypedDict):
+    """A group of findings as the page gets it, with the frames that the page does not have yet.
+
+    Lists are in the order of ``rank``. ``reasons`` say why it comes early.
+    """
+
+    number: int
+    what: str
+    name: str
+    reasons: list[str]
+    rank: tuple[float, ...]
+    sights: list[FindingFrame]
 
 
 class StoredGroup(NamedTuple):
@@ -316,7 +299,7 @@ class FindingList:
                     "name": group.name,
                     "reasons": group.reasons,
                     "rank": group.rank,
-                    "sights": [frame.sight for frame in group.frames[sent_counts.get(group.number, 0) :]],
+                    "sights": group.frames[sent_counts.get(group.number, 0) :],
                 }
                 for group in changed_groups
             ]

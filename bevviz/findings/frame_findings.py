@@ -261,7 +261,7 @@ def _of_box(
 
 def _of_detection(traces: FrameIndex, what: str, camera_name: str, row: int) -> Finding | None:
     """Return a detection as a finding; None: it did not have to be found."""
-    camera, frame = traces.camera(camera_name), traces.result.frame
+    camera, frame = traces.result.camera(camera_name), traces.result.frame
     if camera is None or camera.detections is None:
         return None
     subject = detection_subject(traces.result, camera, row)

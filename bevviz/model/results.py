@@ -6,7 +6,7 @@ The conventions are those of `bevviz.model.frame`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Literal
@@ -152,10 +152,25 @@ class Detections(Tabular):
         return {"name": self.names, "score": self.score, "state": states, **box}
 
     @staticmethod
+    def of_boxes(xyxy: F32, score: F32, names: Sequence[str]) -> Detections:
+        """Return detections that are all kept."""
+        zero = np.zeros(len(names), np.int32)
+        kept = zero + np.int32(DetectionState.KEPT)
+        return Detections(xyxy, score, zero, tuple(names), kept, zero - 1, np.zeros(len(names), np.float32))
+
+    @staticmethod
+    def joined(several: Sequence[Detections]) -> Detections:
+        """Return the detections of several, in order, without masks."""
+        arrays = ("xyxy", "score", "class_id", "state", "suppressed_by", "overlap")
+        values: dict[str, Any] = {
+            name: np.concatenate([getattr(one, name) for one in several]) for name in arrays
+        }
+        return Detections(names=tuple(name for one in several for name in one.names), **values)
+
+    @staticmethod
     def empty() -> Detections:
         """Return zero detections."""
-        f, i = np.zeros(0, np.float32), np.zeros(0, np.int32)
-        return Detections(np.zeros((0, 4), np.float32), f, i, (), i, i, f)
+        return Detections.of_boxes(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), ())
 
 
 class Decision(IntEnum):
@@ -253,6 +268,11 @@ class Fusion:
     cluster_uv: F32  # (K, 4) x0, y0, x1, y1 around the projected cluster, NaN if not in view
     claims: Claims | None = None  # None: clusters are matched whole
     detection_covered: I32 | None = None  # (D,) number of detection_points in the mask, -1: mask not used
+
+    def matched_cluster(self, detection: int) -> int:
+        """Return the cluster that a detection was matched with, -1: none."""
+        is_matched = self.detection_decision[detection] == Decision.MATCHED
+        return int(self.detection_cluster[detection]) if is_matched else -1
 
     def pair(self, detection: int, cluster: int) -> Pair | None:
         """Return the evidence of a detection and a cluster, or None if the fusion did not compare them."""
@@ -483,6 +503,15 @@ class FrameResult:
         failures = [f"{failure.stage} failed: {failure.reason}" for failure in self.failures]
         return preview(repr(self)[1:-1], pictures, objects, failures)
 
+    def camera(self, name: str) -> CameraResult | None:
+        """Return the result of a camera. None: there is no camera of that name."""
+        return next((camera for camera in self.cameras if camera.camera.name == name), None)
+
+    def fusion(self, camera: str) -> Fusion | None:
+        """Return the result of the fusion for a camera. None: it did not run."""
+        result = self.camera(camera)
+        return None if result is None else result.fusion
+
     @staticmethod
     def unprocessed(
         frame: Frame, config: Config, cameras: tuple[CameraResult, ...] | None = None
@@ -508,6 +537,26 @@ class Explanation:
         """The kind of the reason as one word; the opinion of a camera in its own words."""
         word = self.reason.kind.value
         return word if self.subject == "object" else word.replace(" ", "_")
+
+
+def explanations_of(
+    explanations: Iterable[Explanation], subject: str, camera: str | None = None
+) -> list[Explanation]:
+    """Return the explanations of a subject. ``camera``: of one camera; None: of all."""
+    return [
+        explanation
+        for explanation in explanations
+        if explanation.subject == subject and camera in (None, explanation.camera)
+    ]
+
+
+def texts_by_row(
+    explanations: Iterable[Explanation], subject: str, camera: str | None = None
+) -> dict[int, str]:
+    """Return row -> text of the explanations of a subject, see ``explanations_of``."""
+    return {
+        explanation.row: explanation.text for explanation in explanations_of(explanations, subject, camera)
+    }
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from bevviz import anomalies
 from bevviz.config import BevConfig
 from bevviz.model import geometry
 from bevviz.model.frame import F64, I64, Frame, LabelledBoxes2D, LabelledBoxes3D, LateBoxes
-from bevviz.model.results import BOX_SIDES, FrameResult, Objects, Opinion, Tracks
+from bevviz.model.results import BOX_SIDES, FrameResult, Objects, Opinion, Tracks, texts_by_row
 from bevviz.recording import entities
 from bevviz.recording.addresses import Rows
 from bevviz.recording.components import Components
@@ -21,7 +21,7 @@ from bevviz.recording.entities import TRACK_COLORS, ClassId
 from bevviz.recording.labels import choose_named_in_3d, shown
 from bevviz.recording.layers import Layer, Style, callouts, draw
 from bevviz.recording.opinions import outline_colors
-from bevviz.recording.primitives import scored, texts_by_row, transform
+from bevviz.recording.primitives import scored, transform
 from bevviz.recording.projection import bev_outlines, bev_pixels, ground_outlines
 from bevviz.recording.writer import Writer
 from bevviz.support.colors import CONTEXT, SERIES_COLORS, class_color

@@ -8,9 +8,9 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from bevviz.model.reasons import ReasonKind
-from bevviz.model.results import Detections, DetectionState, Explanation, FrameResult
+from bevviz.model.results import Detections, DetectionState, Explanation, FrameResult, explanations_of
 from bevviz.recording import entities
-from bevviz.recording.primitives import document, explanations_of, scored
+from bevviz.recording.primitives import document, scored
 from bevviz.recording.writer import Writer
 from bevviz.support.text import markdown
 

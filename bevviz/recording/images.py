@@ -22,6 +22,7 @@ from bevviz.model.results import (
     Explanation,
     FrameResult,
     Masks,
+    texts_by_row,
 )
 from bevviz.recording import entities, retention
 from bevviz.recording.addresses import Rows
@@ -35,7 +36,6 @@ from bevviz.recording.primitives import (
     jpeg,
     png,
     scored,
-    texts_by_row,
     transform,
 )
 from bevviz.recording.projection import edges

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from bevviz.model.frame import F32, I64, Boxes3D, Camera
-from bevviz.model.results import FrameResult, Objects, Opinion
+from bevviz.model.results import FrameResult, Objects, Opinion, texts_by_row
 from bevviz.recording import entities
 from bevviz.recording.addresses import Rows
 from bevviz.recording.labels import NameRoom, choose_named_in_3d, shown, under
 from bevviz.recording.layers import Layer, Style, callouts, draw, name_layers
-from bevviz.recording.primitives import CORNER, scored, texts_by_row, transform
+from bevviz.recording.primitives import CORNER, scored, transform
 from bevviz.recording.projection import bev_outlines, bounds_of, image_outlines
 from bevviz.recording.writer import Writer
 from bevviz.support.colors import OPINION_COLORS, Color, StateColor, class_color

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bevviz.model import geometry
 from bevviz.model.frame import F32, F64, U8, Image
-from bevviz.model.results import ClusterState, DetectionState, Explanation
+from bevviz.model.results import ClusterState, DetectionState
 from bevviz.recording import entities
 from bevviz.recording.components import Components
 from bevviz.recording.entities import ClassId
@@ -48,26 +48,6 @@ def scored(names: Iterable[str], scores: Iterable[Any]) -> list[str]:
     """Format each name with its score, as in ``person 0.90``."""
     numbers = scores.tolist() if isinstance(scores, np.ndarray) else scores  # Python's are formatted faster
     return [f"{name} {score:.2f}" for name, score in zip(names, numbers, strict=True)]
-
-
-def explanations_of(
-    explanations: Iterable[Explanation], subject: str, camera: str | None = None
-) -> list[Explanation]:
-    """Return the explanations of a subject. ``camera``: of one camera; None: of all."""
-    return [
-        explanation
-        for explanation in explanations
-        if explanation.subject == subject and camera in (None, explanation.camera)
-    ]
-
-
-def texts_by_row(
-    explanations: Iterable[Explanation], subject: str, camera: str | None = None
-) -> dict[int, str]:
-    """Return row -> text of the explanations of a subject, see ``explanations_of``."""
-    return {
-        explanation.row: explanation.text for explanation in explanations_of(explanations, subject, camera)
-    }
 
 
 def document(text: str) -> Components:

@@ -111,8 +111,10 @@ def _read(roles: Roles) -> list[str]:
         *roles.lidars,
         *roles.tf,
         *roles.tf_static,
+        *roles.imus,
         *roles.robot_detections_2d,
         *roles.robot_detections_3d,
+        *roles.robot_clouds,
         *(name for name in (*cameras, *single) if name),
     ]
 

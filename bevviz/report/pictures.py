@@ -18,7 +18,6 @@ from bevviz.stages.voxel import spread_to_points
 from bevviz.support.colors import Color, StateColor, class_color, color_rows, turbo
 from bevviz.why import Answer
 from bevviz.why.log import focus_point
-from bevviz.why.subject import projected_box
 
 Series = Sequence[tuple[float, float]]  # (x, y) pairs
 
@@ -109,10 +108,12 @@ def marked_pictures(result: FrameResult, answer: Answer, width: int) -> list[tup
     """
     marked = []
     for result_of_camera in result.cameras:
-        camera, outline = result_of_camera.camera, _outline_in_image(result_of_camera, answer)
-        picture = None if outline is None else camera_picture(result_of_camera, width)
-        if outline is None or picture is None or camera.image is None:
+        camera = result_of_camera.camera
+        box_in_image = answer.subject.image_box(camera)
+        picture = None if box_in_image is None else camera_picture(result_of_camera, width)
+        if box_in_image is None or picture is None or camera.image is None:
             continue
+        outline = np.asarray(box_in_image, np.float64)[[[0, 1], [2, 1], [2, 3], [0, 3]]]
         scale = picture.shape[1] / camera.image.bgr.shape[1]
         _mark(picture, (outline + 0.5) * scale - 0.5, answer.subject.name)
         marked.append((picture, f"{camera.name}: white is {answer.subject.name}"))
@@ -125,18 +126,9 @@ def marked_pictures(result: FrameResult, answer: Answer, width: int) -> list[tup
     return marked
 
 
-def _outline_in_image(result: CameraResult, answer: Answer) -> F64 | None:
-    """Return the (4, 2) corners of the subject's rectangle in an image. None: the image does not show it."""
-    subject = answer.subject
-    xyxy = subject.xyxy if subject.camera == result.camera.name else None
-    if subject.box is not None:
-        xyxy = projected_box(subject.box, result.camera)
-    return None if xyxy is None else np.asarray(xyxy, np.float64)[[[0, 1], [2, 1], [2, 3], [0, 3]]]
-
-
 def _box_around_points(result: FrameResult, answer: Answer) -> Boxes3D | None:
     """Return a box at the points of a subject without one. None: it has no points."""
-    focus = focus_point(result.frame, answer) if len(answer.fate) == len(result.frame.points) else None
+    focus = focus_point(result.frame, answer)
     size, yaw = np.full((1, 3), PLACE, np.float32), np.zeros(1, np.float32)
     return None if focus is None else Boxes3D(focus[None], size, yaw)
 

@@ -79,7 +79,7 @@ def cause_of(result: FrameResult, seconds: float, answer: Answer, tried: TriedVa
 
 def _place(result: FrameResult, answer: Answer) -> str:
     """Return where the subject is, seen from the sensor, with a comma at the end."""
-    focus = focus_point(result.frame, answer) if len(answer.fate) == len(result.frame.points) else None
+    focus = focus_point(result.frame, answer)
     if focus is None:
         camera = answer.subject.camera
         return f"In the image of {camera}, " if camera else ""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from bevviz.model.frame import Frame
 from bevviz.model.results import FrameResult
+from bevviz.recording.decisions import problem_lines
 from bevviz.recording.health import FrameRates, health
 from bevviz.report.pictures import camera_picture, jpeg, shrink
 from bevviz.why.false_objects import false_reasons
@@ -76,19 +77,11 @@ class WindowSummary:
         self.tracebacks.update(
             (failure.stage, failure.traceback) for failure in result.failures if failure.traceback
         )
-        problems = [f"{failure.stage}: {failure.reason}" for failure in result.failures]
-        problems += frame.problems
-        problems += [
-            f"{camera_result.camera.name}: {problem}"
-            for camera_result in result.cameras
-            for problem in camera_result.camera.problems
-        ]
+        problems = tuple(text for _, text in problem_lines(result))
         self._rates.add(frame)
         measured = dict(health(result, self._last, self._rates))
         marks = frame.around.marks if frame.around is not None else ()
-        summary = FrameSummary(
-            frame.index, frame.stamp, frame.received, measured, states, tuple(problems), marks
-        )
+        summary = FrameSummary(frame.index, frame.stamp, frame.received, measured, states, problems, marks)
         if self._is_for_strip(len(self.frames)):
             self.strip.append((summary, strip_pictures(result)))
         if self.result is None or self._distance(frame) < self._distance(self.result.frame):

@@ -10,7 +10,7 @@ from bevviz.errors import StageError
 from bevviz.model import geometry
 from bevviz.model.box_points import inside_each
 from bevviz.model.frame import F32, F64, Bool, Boxes3D, Camera, Frame, LabelledBoxes2D, LabelledBoxes3D
-from bevviz.model.results import Clusters, ClusterState, Detections, DetectionState, Ground, Objects
+from bevviz.model.results import Clusters, ClusterState, Detections, Ground, Objects
 from bevviz.stages.cells import cell_keys
 from bevviz.stages.user_stages import heights_above_ground, make_objects
 
@@ -94,11 +94,8 @@ def find_objects(frame: Frame, topic: str, obstacles: F32 | None, clusters: Clus
 def detections_of(labelled: LabelledBoxes2D) -> Detections:
     """Make detections from labelled image boxes, best score first. All are kept."""
     order = np.argsort(-labelled.scores, kind="stable")
-    zero = np.zeros(len(order), np.int32)
-    kept = np.full(len(order), DetectionState.KEPT, np.int32)
-    names = tuple(labelled.labels[d] for d in order)
-    overlap = np.zeros(len(order), np.float32)
-    return Detections(labelled.xyxy[order], labelled.scores[order], zero, names, kept, zero - 1, overlap)
+    names = [labelled.labels[d] for d in order]
+    return Detections.of_boxes(labelled.xyxy[order], labelled.scores[order], names)
 
 
 def in_points_frame(pose: F64, labelled: LabelledBoxes3D) -> Boxes3D:

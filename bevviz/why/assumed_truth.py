@@ -8,11 +8,9 @@ from bevviz.evaluate import Truth
 from bevviz.model import geometry
 from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import F32, Bool, ImageLabels
-from bevviz.model.results import CameraResult, Detections, DetectionState
-from bevviz.stages.clustering import describe_clusters
-from bevviz.stages.frustum_fusion import claim_clusters
+from bevviz.model.results import CameraResult, Detections
 from bevviz.why.frame_index import FEW, FrameIndex
-from bevviz.why.ideal import NO_LIMITS, SURE
+from bevviz.why.ideal import SURE, claim_freely, ideal_config
 from bevviz.why.subject import Subject
 from bevviz.why.verdict import ROAD
 
@@ -42,14 +40,12 @@ def assumed_truth(subject: Subject, traces: FrameIndex) -> Truth | None:
     rows = np.flatnonzero(~(height < ROAD) & _in_box(uv, depth, xyxy))
     if len(rows) < FEW or not names:
         return None
-    points, fusion = result.voxels.points[rows], result.config.fusion.model_copy(update=NO_LIMITS)
-    asked = CameraResult(view, _detections_of(xyxy, names), None, uv[rows], depth[rows])
-    clustering = result.config.clustering.model_copy(update={"min_cluster_points": 1})
-    noise = describe_clusters(points, np.full(len(rows), -1, np.int32), clustering)
+    sure = np.full(len(names), SURE, np.float32)  # A detection of each class has the same box.
+    detections = Detections.of_boxes(np.tile(xyxy, (len(names), 1)).astype(np.float32), sure, names)
+    asked = CameraResult(view, detections, None, uv[rows], depth[rows])
     known = None if np.isnan(height[rows]).any() else height[rows]
-    _, (claims,), _ = claim_clusters(
-        points, known, noise, (asked,), fusion, result.config.objects, clustering
-    )
+    config = ideal_config(result.config, ("clustering",))
+    claims = claim_freely(result.voxels.points[rows], known, asked, config)
     if claims is None or claims.cluster.max() < 0:
         return None
     best = int(claims.cluster.argmax())
@@ -73,7 +69,7 @@ def _image_box(subject: Subject, traces: FrameIndex) -> tuple[CameraResult | Non
     """Return the image box of a subject and its camera. A cluster has that which it fits best."""
     xyxy = subject.xyxy if subject.asked is None else subject.asked
     if subject.kind != "cluster":
-        return traces.camera(subject.camera), xyxy
+        return traces.result.camera(subject.camera), xyxy
     best: tuple[CameraResult | None, F32 | None] = None, xyxy
     most = 0.0
     for camera in traces.result.cameras:
@@ -96,17 +92,3 @@ def _likely_names(traces: FrameIndex, xyxy: F32) -> tuple[str, ...]:
         if NARROW * width / height <= wide / max(tall, 1.0) <= WIDE * length / height
     ]
     return tuple(likely or known)
-
-
-def _detections_of(xyxy: F32, names: tuple[str, ...]) -> Detections:
-    """Return a sure detection of each class in one image box."""
-    count = len(names)
-    return Detections(
-        np.repeat(xyxy[None], count, axis=0).astype(np.float32),
-        np.full(count, SURE, np.float32),
-        np.arange(count, dtype=np.int32),
-        names,
-        np.full(count, DetectionState.KEPT, np.int32),
-        np.full(count, -1, np.int32),
-        np.zeros(count, np.float32),
-    )

@@ -8,7 +8,7 @@ import numpy as np
 
 from bevviz.model.frame import F32, I64, U8
 from bevviz.model.reasons import Scored
-from bevviz.model.results import CameraResult, ClusterState, Decision, DetectionState, FrameResult, Fusion
+from bevviz.model.results import ClusterState, Decision, DetectionState
 from bevviz.why.subject import Subject
 
 MOST = 0.5  # least share of the main cause, and of a cluster that belongs mostly to one object
@@ -194,9 +194,3 @@ class Evidence:
         if part is None:
             return 1.0 if self.main < 0 else 0.0
         return part.points / max(part.count, 1)
-
-
-def camera_and_fusion(result: FrameResult, camera: str) -> tuple[CameraResult, Fusion | None]:
-    """Return the result of a camera and its fusion."""
-    result_of_camera = next(c for c in result.cameras if c.camera.name == camera)
-    return result_of_camera, result_of_camera.fusion

@@ -9,8 +9,8 @@ import numpy as np
 from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model import box_overlap, geometry
 from bevviz.model.reasons import Reason, ReasonKind, scored
-from bevviz.model.results import Decision, Objects
-from bevviz.why.evidence import MOST, camera_and_fusion
+from bevviz.model.results import Objects
+from bevviz.why.evidence import MOST
 from bevviz.why.frame_index import FrameIndex, detection_subject
 from bevviz.why.reason_text import WITHIN
 from bevviz.why.subject import MARGIN, points_in_box
@@ -51,7 +51,7 @@ def _cause(traces: FrameIndex, objects: Objects, row: int) -> Reason:
     """Return the cause of an object that no ground truth explains."""
     assert traces.matches is not None
     name, partner = objects.names[row], traces.matches.partner
-    owner = _owner(traces, objects, row)
+    owner = traces.owner_of(objects.camera[row], int(objects.detection[row]))
     holder = _holder_of_points(traces, objects, row)
     inside = _label_around(traces, objects, row)
     for number in dict.fromkeys((holder, owner, inside)):
@@ -125,12 +125,6 @@ def _doubt(traces: FrameIndex, objects: Objects, row: int) -> Reason | None:
     return None
 
 
-def _owner(traces: FrameIndex, objects: Objects, row: int) -> int:
-    """Return the row of the ground truth object whose box the object's detection is, -1: none."""
-    camera = traces.camera(objects.camera[row])
-    return -1 if camera is None else int(traces.owners(camera)[objects.detection[row]])
-
-
 def _holder_of_points(traces: FrameIndex, objects: Objects, row: int) -> int:
     """Return the row of the ground truth object that holds most points of an object, -1: none."""
     points, cluster = traces.result.frame.points, int(objects.cluster[row])
@@ -183,8 +177,7 @@ def _is_barely_accepted(traces: FrameIndex, objects: Objects, row: int) -> bool:
 
     Right objects are cut out of larger clusters, too, but suit their detections better.
     """
-    camera, detection = objects.camera[row], int(objects.detection[row])
-    fusion = camera_and_fusion(traces.result, camera)[1] if camera else None
+    fusion, detection = traces.result.fusion(objects.camera[row]), int(objects.detection[row])
     config = traces.result.config.fusion
     if fusion is None:
         return False
@@ -196,14 +189,11 @@ def _is_barely_accepted(traces: FrameIndex, objects: Objects, row: int) -> bool:
 
 def _off_its_box(traces: FrameIndex, objects: Objects, row: int) -> float:
     """Return the metres by which an object is behind the points in the middle of its 2D box."""
-    camera_name, detection = objects.camera[row], int(objects.detection[row])
-    if not camera_name or detection < 0:
+    camera, detection = traces.result.camera(objects.camera[row]), int(objects.detection[row])
+    if camera is None or (fusion := camera.fusion) is None or detection < 0:
         return 0.0
-    camera, fusion = camera_and_fusion(traces.result, camera_name)
     view = camera.camera
-    if view.camera_from_points is None or fusion is None:
-        return 0.0
-    if fusion.detection_decision[detection] != Decision.MATCHED:
+    if view.camera_from_points is None or fusion.matched_cluster(detection) < 0:
         return 0.0
     pair = fusion.pair(detection, int(objects.cluster[row]))
     points = traces.place(detection_subject(traces.result, camera, detection))

@@ -14,7 +14,7 @@ from bevviz.model import geometry
 from bevviz.model.box_points import rows_in_rectangles
 from bevviz.model.decisions import unmatched_detections
 from bevviz.model.frame import F32, I32, I64, U8, U16, Bool, Boxes3D
-from bevviz.model.reasons import Reason, StageOwner, owner_of
+from bevviz.model.reasons import Reason, Scored, StageOwner, owner_of, scored
 from bevviz.model.results import CameraResult, Decision, FrameResult
 from bevviz.stages.visibility import image_boxes, share_in_image
 from bevviz.why.detection_fits import Fits, find_fits
@@ -211,7 +211,7 @@ class FrameIndex:
                 return np.asarray(rows[away < box.size[0, 0] / 2])
             foot = -MARGIN if subject.kind == "cell" else FOOT
             return rows[points_in_box(box, points[rows], MARGIN, foot)]
-        camera = self.camera(subject.camera)
+        camera = self.result.camera(subject.camera)
         if camera is None or subject.xyxy is None:
             return np.zeros(0, np.int64)
         rows = self._in_frustum(camera, subject.xyxy)
@@ -261,10 +261,6 @@ class FrameIndex:
         near = middle[first]
         foreground: I64 = rows[(depth >= near - DEPTH) & (depth <= near + 2 * DEPTH)]
         return foreground
-
-    def camera(self, name: str) -> CameraResult | None:
-        """Return the result of a camera, None for an unknown name."""
-        return next((c for c in self.result.cameras if c.camera.name == name), None)
 
     # --- the ground truth ----------------------------------------------------------------------
 
@@ -317,7 +313,7 @@ class FrameIndex:
 
     def _detections_to_match(self, name: str) -> Collection[int]:
         """Return the kept detections of a camera, without doubles."""
-        camera = self.camera(name)
+        camera = self.result.camera(name)
         if camera is None or camera.detections is None:
             return ()
         rows, fusion = np.flatnonzero(camera.detections.kept), camera.fusion
@@ -388,6 +384,17 @@ class FrameIndex:
     def owners(self, camera: CameraResult) -> I64:
         """Return the (D,) row of the ground truth object of each detection, -1: none."""
         return self.fits(camera).owner
+
+    def owner_of(self, camera: str, detection: int) -> int:
+        """Return the row of the ground truth object of a detection, -1: none, or no detection."""
+        result = self.result.camera(camera)
+        return -1 if result is None else int(self.owners(result)[detection])
+
+    def scored(self, camera: str, detection: int) -> Scored:
+        """Return class and score of a detection."""
+        result = self.result.camera(camera)
+        assert result is not None and result.detections is not None
+        return scored(result.detections, detection)
 
     def _image_boxes(self, camera: CameraResult) -> tuple[F32, F32]:
         """Return (K, 4) projected boxes of the ground truth, and the image boxes around their points."""
@@ -464,11 +471,11 @@ def detection_subject(result: FrameResult, camera: CameraResult, row: int) -> Su
     """Return a detection as a subject of its own."""
     detections, clusters = camera.detections, result.clusters
     assert detections is not None
-    label, fusion = detections.names[row], camera.fusion
+    label = detections.names[row]
+    cluster = -1 if camera.fusion is None else camera.fusion.matched_cluster(row)
     name = f"the {label} {detections.score[row]:.2f} in {camera.camera.name}"
-    if clusters is not None and fusion is not None and fusion.detection_decision[row] == Decision.MATCHED:
-        boxes = clusters.boxes(result.config.clustering)
-        name += f" at {boxes.distance[fusion.detection_cluster[row]]:.1f} m"
+    if clusters is not None and cluster >= 0:
+        name += f" at {clusters.boxes(result.config.clustering).distance[cluster]:.1f} m"
     return Subject(
         "detection", name, label, frozenset({label.lower()}), row, camera.camera.name, detections.xyxy[row]
     )

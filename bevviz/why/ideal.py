@@ -18,6 +18,7 @@ from bevviz.model import geometry
 from bevviz.model.frame import F32, I64, Boxes3D, Camera
 from bevviz.model.results import (
     CameraResult,
+    Claims,
     Clusters,
     ClusterState,
     Detections,
@@ -113,18 +114,32 @@ class IdealStages:
 
     def _claimed_box(self, obstacles: F32, rows: I64, camera: CameraResult, detection: int) -> Boxes3D | None:
         """Return the box that a detection gets if it may claim some points, and no others."""
-        config, detections = self._traces.result.config, camera.detections
+        detections = camera.detections
         assert detections is not None and camera.uv is not None and camera.depth is not None
-        alone = replace(camera, detections=_single(detections, detection), fusion=None)
-        alone = replace(alone, uv=camera.uv[rows], depth=camera.depth[rows])
-        noise = describe_clusters(obstacles[rows], np.full(len(rows), -1, np.int32), config.clustering)
+        one = slice(detection, detection + 1)
+        alone = Detections.of_boxes(detections.xyxy[one], detections.score[one], detections.names[one])
+        asked = CameraResult(camera.camera, alone, None, camera.uv[rows], camera.depth[rows])
         height = self._ground.height.compress(~self._ground.mask)[rows]
-        fusion = config.fusion.model_copy(update=NO_LIMITS)
-        clustering = ideal_config(config, self._stages).clustering
-        _, (claims,), _ = claim_clusters(
-            obstacles[rows], height, noise, (alone,), fusion, config.objects, clustering
-        )
+        config = ideal_config(self._traces.result.config, self._stages)
+        claims = claim_freely(obstacles[rows], height, asked, config)
         return None if claims is None or claims.cluster[0] < 0 else claims.boxes.chosen([0])
+
+
+def claim_freely(points: F32, height: F32 | None, camera: CameraResult, config: Config) -> Claims | None:
+    """Return what the detections of a camera claim of some points without the limits of the fusion.
+
+    Args:
+        points: (N, 3) points in no cluster.
+        height: (N,) metres above the local ground. None: unknown.
+        camera: the detections, and the points in the image.
+        config: configuration of the fusion.
+    """
+    noise = describe_clusters(points, np.full(len(points), -1, np.int32), config.clustering)
+    fusion = config.fusion.model_copy(update=NO_LIMITS)
+    _, (claims,), _ = claim_clusters(
+        points, height, noise, (camera,), fusion, config.objects, config.clustering
+    )
+    return claims
 
 
 def ideal_config(config: Config, stages: Container[str]) -> Config:
@@ -141,19 +156,12 @@ def _with_own_detections(
     """Return the detections with an ideal one of each object in the image, in place of its own ones."""
     boxes = _image_boxes(traces, camera)
     shown = [row for row in rows if np.isfinite(boxes[row]).all()]
-    result, state = traces.camera(camera.name), detections.state.copy()
+    result, state = traces.result.camera(camera.name), detections.state.copy()
     if result is not None and result.detections is not None and len(result.detections) == len(detections):
         state[np.isin(traces.owners(result), shown)] = DetectionState.BELOW_THRESHOLD
-    count = len(shown)
-    return Detections(
-        np.concatenate([detections.xyxy, boxes[shown].astype(np.float32)]),
-        np.concatenate([detections.score, np.full(count, SURE, np.float32)]),
-        np.concatenate([detections.class_id, np.zeros(count, np.int32)]),
-        (*detections.names, *(_name(traces, row, detections) for row in shown)),
-        np.concatenate([state, np.full(count, DetectionState.KEPT, np.int32)]).astype(np.int32),
-        np.concatenate([detections.suppressed_by, np.full(count, -1, np.int32)]).astype(np.int32),
-        np.concatenate([detections.overlap, np.zeros(count, np.float32)]),
-    )
+    names = [_name(traces, row, detections) for row in shown]
+    own = Detections.of_boxes(boxes[shown].astype(np.float32), np.full(len(shown), SURE, np.float32), names)
+    return Detections.joined([replace(detections, state=state), own])
 
 
 def _image_boxes(traces: FrameIndex, camera: Camera) -> F32:
@@ -170,20 +178,6 @@ def _name(traces: FrameIndex, row: int, detections: Detections) -> str:
     subject = traces.truth[row]
     known = (name for name in (*detections.names, *traces.classes) if subject.accepts(name))
     return next(known, None) or min(subject.accepted, default=subject.label.lower())
-
-
-def _single(detections: Detections, row: int) -> Detections:
-    """Return one of the detections, without its mask."""
-    one = np.array([row])
-    return Detections(
-        detections.xyxy[one],
-        detections.score[one],
-        detections.class_id[one],
-        (detections.names[row],),
-        detections.state[one],
-        np.full(1, -1, np.int32),
-        np.zeros(1, np.float32),
-    )
 
 
 def _with_object(objects: Objects, camera: CameraResult, detection: int, box: Boxes3D) -> Objects:

@@ -11,7 +11,7 @@ import numpy as np
 from bevviz.errors import UserError
 from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D
-from bevviz.model.results import Decision, FrameResult, Tracks
+from bevviz.model.results import FrameResult, Tracks
 from bevviz.stages.robot_results import in_points_frame
 from bevviz.why.selection import Selection
 from bevviz.why.subject import Subject
@@ -172,15 +172,12 @@ def _find_truth(identity: Identity, result: FrameResult) -> tuple[Selection | No
 
 def _find_detection(identity: Identity, result: FrameResult) -> int:
     """Return the row of the detection of the same class and place in the image, -1: none."""
-    for camera in result.cameras:
-        detections = camera.detections
-        if camera.camera.name == identity.camera and detections is not None and len(detections):
-            box = np.array([identity.box], np.float32)
-            overlap = geometry.iou(box, detections.xyxy)[0]
-            overlap[[name.lower() != identity.label for name in detections.names]] = 0
-            if overlap.max() >= SAME_BOX:
-                return int(overlap.argmax())
-    return -1
+    camera = result.camera(identity.camera)
+    if camera is None or camera.detections is None:
+        return -1
+    overlap = geometry.iou(np.array([identity.box], np.float32), camera.detections.xyxy)[0]
+    overlap[[name.lower() != identity.label for name in camera.detections.names]] = 0
+    return int(overlap.argmax()) if overlap.max(initial=0) >= SAME_BOX else -1
 
 
 def _find_at(at: tuple[float, ...], identity: Identity, result: FrameResult) -> tuple[Selection | None, str]:
@@ -217,11 +214,8 @@ def _rows(result: FrameResult, subject: Subject) -> tuple[int, int]:
     if subject.kind == "object" and objects is not None:
         return row, int(objects.cluster[row])
     cluster = row if subject.kind == "cluster" else -1
-    for camera in result.cameras:
-        fusion = camera.fusion
-        if subject.kind == "detection" and camera.camera.name == subject.camera and fusion is not None:
-            matched = fusion.detection_decision[row] == Decision.MATCHED
-            cluster = int(fusion.detection_cluster[row]) if matched else -1
+    if subject.kind == "detection" and (fusion := result.fusion(subject.camera)) is not None:
+        cluster = fusion.matched_cluster(row)
     if cluster < 0 or objects is None:
         return -1, cluster
     rows = np.flatnonzero(objects.cluster == cluster)

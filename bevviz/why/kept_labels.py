@@ -74,7 +74,7 @@ def _fit(subject: Subject, label: Subject, pick: str, traces: FrameIndex) -> flo
     """Return how well a subject fits a label. A detection may be the one that the label was drawn for."""
     assert label.box is not None
     if subject.kind in ("detection", "pixel"):
-        camera = traces.camera(subject.camera)
+        camera = traces.result.camera(subject.camera)
         around = None if camera is None else projected_box(label.box, camera.camera)
         if subject.xyxy is None:
             return 0.0

@@ -23,7 +23,6 @@ from bevviz.support.colors import FATE_COLORS, StateColor
 from bevviz.why.answer import Answer
 from bevviz.why.answer_text import markdown_page
 from bevviz.why.frame_index import Fate
-from bevviz.why.subject import projected_box
 
 COLORS = {
     Fate.GROUND: FATE_COLORS["ground"],
@@ -116,6 +115,8 @@ def focus_point(frame: Frame, answer: Answer) -> F32 | None:
     """Return the (3,) position of an answer in Frame.points_frame; None: unknown."""
     if answer.subject.box is not None:
         return np.asarray(answer.subject.box.center[0], np.float32)
+    if len(answer.fate) != len(frame.points):
+        return None
     points = frame.points[(answer.fate > 0) & (answer.fate != Fate.IN_FRONT)]
     return np.median(points, axis=0).astype(np.float32) if len(points) else None
 
@@ -225,7 +226,8 @@ def _frustums(camera: Camera, answer: Answer) -> list[F32]:
 
 def _image_layers(camera: Camera, answers: Sequence[Answer]) -> Iterator[Layer]:
     """Yield the boxes of the subjects over a camera's image, and the name of the first one."""
-    seen = {row: box for row, one in enumerate(answers) if (box := _image_box(camera, one)) is not None}
+    boxes_by_row = {row: answer.subject.image_box(camera) for row, answer in enumerate(answers)}
+    seen = {row: box for row, box in boxes_by_row.items() if box is not None}
     if not seen:
         return
     boxes, order = np.array(list(seen.values()), np.float32), 40.0
@@ -247,13 +249,5 @@ def cameras_of(frame: Frame, answer: Answer) -> list[str]:
 
 def _image_boxes(frame: Frame, answer: Answer) -> dict[str, F32]:
     """Return the (4,) box of an answer's subject in the image of each camera that sees it."""
-    boxes = {camera.name: _image_box(camera, answer) for camera in frame.cameras}
+    boxes = {camera.name: answer.subject.image_box(camera) for camera in frame.cameras}
     return {name: box for name, box in boxes.items() if box is not None}
-
-
-def _image_box(camera: Camera, answer: Answer) -> F32 | None:
-    """Return the (4,) box of an answer's subject in a camera's image. None: it is not there."""
-    subject = answer.subject
-    if subject.box is not None:
-        return projected_box(subject.box, camera)
-    return subject.xyxy if subject.camera == camera.name else None

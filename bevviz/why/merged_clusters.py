@@ -8,7 +8,7 @@ import numpy as np
 
 from bevviz.model import geometry
 from bevviz.model.frame import F32, I32, I64, Bool
-from bevviz.model.reasons import Scored, scored
+from bevviz.model.reasons import Scored
 from bevviz.stages.clustering import dbscan
 from bevviz.support.numba_kernel import kernel
 from bevviz.why.evidence import MOST
@@ -121,9 +121,7 @@ def _joining_detection(traces: FrameIndex, cluster: int) -> Scored | None:
     rows = [] if splits is None else np.flatnonzero(splits.cluster == cluster).tolist()
     if splits is None or not rows:
         return None
-    camera = traces.camera(splits.camera[rows[0]])
-    assert camera is not None and camera.detections is not None
-    return scored(camera.detections, int(splits.detection[rows[0]]))
+    return traces.scored(splits.camera[rows[0]], int(splits.detection[rows[0]]))
 
 
 def _detection_of_row(traces: FrameIndex, camera: str, row: int) -> Subject:

@@ -10,7 +10,7 @@ from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model.decisions import mask_evidence, pair_kind
 from bevviz.model.reasons import Limit, Reason, ReasonKind, Scored, limit, limit_of, scored
 from bevviz.model.results import CameraResult, Decision, FrameResult
-from bevviz.why.evidence import Evidence, ReportedObject, camera_and_fusion
+from bevviz.why.evidence import Evidence, ReportedObject
 from bevviz.why.frame_index import Fate, FrameIndex
 from bevviz.why.subject import LINK, Subject, count
 from bevviz.why.subject_matches import find_fused, first_name, opinion_on
@@ -139,8 +139,7 @@ class _ReasonWriter:
 
     def _box_owner(self, camera: str, detection: int) -> str:
         """Name the other ground truth object that a detection belongs to; empty: none."""
-        camera_result = self.traces.camera(camera)
-        owner = -1 if camera_result is None else int(self.traces.owners(camera_result)[detection])
+        owner = self.traces.owner_of(camera, detection)
         return "" if owner in (-1, self.subject.row) else self.traces.truth[owner].name
 
     def _whose(self, camera: str, detection: int) -> str:
@@ -276,9 +275,7 @@ class _ReasonWriter:
             return text
         row = max(rows, key=lambda row: int(splits.points[row]))
         name, detection = splits.camera[row], int(splits.detection[row])
-        camera = self.traces.camera(name)
-        assert camera is not None and camera.detections is not None
-        taker = f"{scored(camera.detections, detection)}{self._whose(name, detection)}"
+        taker = f"{self.traces.scored(name, detection)}{self._whose(name, detection)}"
         return f"{text}: the fusion gave the rest of it to {taker}"
 
     _too_large = _too_small
@@ -341,7 +338,7 @@ class _ReasonWriter:
     def _suppressed(self) -> str:
         best = self.evidence.best
         assert best is not None
-        camera = self.traces.camera(best.camera)
+        camera = self.result.camera(best.camera)
         assert camera is not None and camera.detections is not None
         head = "it" if self.subject.kind == "detection" else f"its detection {best.label}"
         rival = int(camera.detections.suppressed_by[best.row])
@@ -381,8 +378,7 @@ class _ReasonWriter:
         """Return the numbers that the rule of the fusion compared for the best detection and a cluster."""
         best = self.evidence.best
         assert best is not None
-        _, fusion = camera_and_fusion(self.result, best.camera)
-        if fusion is None:
+        if (fusion := self.result.fusion(best.camera)) is None:
             return "not compared"
         pair = fusion.pair(best.row, cluster)
         if pair is None:
@@ -412,15 +408,15 @@ class _ReasonWriter:
     def _taken(self) -> str:
         best, cluster = self.evidence.best, self._cluster
         assert best is not None
-        camera, fusion = camera_and_fusion(self.result, best.camera)
+        fusion = self.result.fusion(best.camera)
         free = fusion is not None and fusion.cluster_decision[cluster] != Decision.MATCHED
         if free and best.cluster >= 0:  # Nobody took its own cluster: the detection wanted another one.
             cluster = best.cluster
         taker = -1 if fusion is None else int(fusion.cluster_detection[cluster])
         text = f"cluster {cluster}, the best for {best.label}, was taken by "
-        if camera.detections is None or taker in (-1, best.row):
+        if taker in (-1, best.row):
             return text + "another camera's detection"
-        return f"{text}{scored(camera.detections, taker)}{self._whose(best.camera, taker)}"
+        return f"{text}{self.traces.scored(best.camera, taker)}{self._whose(best.camera, taker)}"
 
     def _other_cluster(self) -> str:
         assert self.evidence.best is not None
@@ -461,7 +457,7 @@ class _ReasonWriter:
         inputs = (
             f"cluster {cluster} of {names['clustering']} and {best.label} of {names['detector']} are there"
         )
-        _, fusion = camera_and_fusion(self.result, best.camera)
+        fusion = self.result.fusion(best.camera)
         decision = "could not compare them"
         if fusion is not None:
             kind = pair_kind(fusion, self.config, best.row, cluster)

@@ -12,7 +12,7 @@ from bevviz.errors import UserError
 from bevviz.model import box_overlap, geometry
 from bevviz.model.class_names import accepted_names
 from bevviz.model.frame import F32, I64, Boxes3D, Intrinsics
-from bevviz.model.results import CameraResult, Decision, DetectionState, Opinion
+from bevviz.model.results import CameraResult, DetectionState, Opinion
 from bevviz.support.text import did_you_mean
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import CORE, FEW, Fate, FrameIndex, detection_subject
@@ -325,8 +325,8 @@ def _in_image(traces: FrameIndex, selection: Selection) -> Iterator[tuple[Subjec
             is_weak = not camera.detections.kept[row]
             if pixel and is_weak and not _shows_at(traces, camera, subject, image_box):
                 continue
-            if camera.fusion is not None and camera.fusion.detection_decision[row] == Decision.MATCHED:
-                covered.add(int(camera.fusion.detection_cluster[row]))
+            if camera.fusion is not None:
+                covered.add(camera.fusion.matched_cluster(row))
             things.append((subject, fit))
     for cluster, fit in _clusters_at_box(traces, camera, image_box, pixel):
         if cluster not in covered:
@@ -390,10 +390,10 @@ def _nearest(traces: FrameIndex, camera: CameraResult, rows: I64, image_box: F32
 
 def _own_points(traces: FrameIndex, camera: CameraResult, subject: Subject) -> I64:
     """Return the rows of the subject's raw points. A detection has those of the cluster that it named."""
-    fusion, row = camera.fusion, subject.row
-    if subject.kind != "detection" or fusion is None or fusion.detection_decision[row] != Decision.MATCHED:
-        return traces.place(subject)
-    return np.flatnonzero(traces.cluster == fusion.detection_cluster[row])
+    cluster = -1
+    if subject.kind == "detection" and camera.fusion is not None:
+        cluster = camera.fusion.matched_cluster(subject.row)
+    return traces.place(subject) if cluster < 0 else np.flatnonzero(traces.cluster == cluster)
 
 
 def _clusters_of(traces: FrameIndex, points: I64) -> list[int]:

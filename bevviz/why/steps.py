@@ -10,8 +10,8 @@ import numpy as np
 
 from bevviz.model.decisions import detection_reason
 from bevviz.model.reasons import ReasonKind, kind_of, limit, limit_of, scored
-from bevviz.model.results import Decision, DetectionState, Opinion
-from bevviz.why.evidence import Candidate, Evidence, camera_and_fusion
+from bevviz.model.results import Decision, DetectionState, Fusion, Opinion, texts_by_row
+from bevviz.why.evidence import Candidate, Evidence
 from bevviz.why.frame_index import FrameIndex
 from bevviz.why.reason_text import detector_ran, name_of, not_run
 from bevviz.why.subject import Subject, projected_box
@@ -187,7 +187,8 @@ def _detector_steps(subject: Subject, evidence: Evidence, traces: FrameIndex) ->
     if not evidence.candidates:
         yield Step("detector", f"no candidate{by} there", {"candidates": 0})
     for candidate in evidence.candidates[:_SHOWN]:
-        camera, fusion = camera_and_fusion(result, candidate.camera)
+        camera = result.camera(candidate.camera)
+        assert camera is not None
         detections = camera.detections
         assert detections is not None
         numbers = {
@@ -202,27 +203,23 @@ def _detector_steps(subject: Subject, evidence: Evidence, traces: FrameIndex) ->
         if not candidate.own and candidate.owner >= 0:
             state += f", the box of {traces.truth[candidate.owner].name}"
         yield Step("detector", f"{candidate.label}{by}, overlap {candidate.overlap:.2f}: {state}", numbers)
-        if candidate.kept and fusion is not None:
-            yield from _pair_steps(candidate, evidence, traces)
+        if candidate.kept and camera.fusion is not None:
+            yield from _pair_steps(candidate, evidence, traces, camera.fusion)
     more = len(evidence.candidates) - _SHOWN
     if more > 0:
         yield Step("detector", f"{more} weaker candidates more", {"more": more})
 
 
-def _pair_steps(candidate: Candidate, evidence: Evidence, traces: FrameIndex) -> Iterator[Step]:
+def _pair_steps(
+    candidate: Candidate, evidence: Evidence, traces: FrameIndex, fusion: Fusion
+) -> Iterator[Step]:
     """Yield the fusion's decision about a detection, and its pairs with the subject's clusters."""
-    _, fusion = camera_and_fusion(traces.result, candidate.camera)
-    assert fusion is not None
     ours = traces.origin("objects").ours
     stage = "fusion" if ours else "our fusion"
-    key = "detection", candidate.camera, candidate.row
-    explanation = next((x for x in traces.result.explanations if (x.subject, x.camera, x.row) == key), None)
-    if explanation is not None:
-        yield Step(
-            stage,
-            explanation.text,
-            {"decision": candidate.decision.name.lower(), "cluster": candidate.cluster},
-        )
+    texts = texts_by_row(traces.result.explanations, "detection", candidate.camera)
+    if candidate.row in texts:
+        numbers = {"decision": candidate.decision.name.lower(), "cluster": candidate.cluster}
+        yield Step(stage, texts[candidate.row], numbers)
     pairs = fusion.pairs
     interesting = {part.cluster for part in evidence.parts[:3]} - {candidate.cluster}
     for row in np.flatnonzero(pairs.detection == candidate.row).tolist():

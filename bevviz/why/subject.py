@@ -62,6 +62,12 @@ class Subject:
         """Whether only its position is known."""
         return self.kind in ("pixel", "point", "cell")
 
+    def image_box(self, camera: Camera) -> F32 | None:
+        """Return the (4,) box of the subject in a camera's image. None: it is not there."""
+        if self.box is not None:
+            return projected_box(self.box, camera)
+        return self.xyxy if self.camera == camera.name else None
+
     def accepts(self, name: str) -> bool:
         """Return whether the class of a detection or object is right for the subject."""
         return not self.accepted or name.lower() in self.accepted

@@ -9,8 +9,15 @@ import numpy as np
 from bevviz.model import box_overlap, geometry
 from bevviz.model.frame import F32, I64
 from bevviz.model.reasons import Scored, scored
-from bevviz.model.results import CameraResult, Decision, DetectionState, FrameResult, Fusion
-from bevviz.why.evidence import Candidate, ClusterPart, Evidence, ReportedObject, camera_and_fusion
+from bevviz.model.results import (
+    CameraResult,
+    Decision,
+    DetectionState,
+    FrameResult,
+    Fusion,
+    texts_by_row,
+)
+from bevviz.why.evidence import Candidate, ClusterPart, Evidence, ReportedObject
 from bevviz.why.frame_index import FEW, PART, FrameIndex
 from bevviz.why.subject import LINK, Subject, points_in_box, projected_box
 
@@ -78,10 +85,7 @@ def _may_belong(fusion: Fusion, detection: int, cluster: int, xyxy: F32) -> bool
 
     A detection that was matched with another cluster does not, unless it covers this one.
     """
-    if (
-        fusion.detection_decision[detection] != Decision.MATCHED
-        or fusion.detection_cluster[detection] == cluster
-    ):
+    if fusion.matched_cluster(detection) in (-1, cluster):
         return True
     around = fusion.cluster_uv[cluster]
     low, high = np.maximum(around[:2], xyxy[:2]), np.minimum(around[2:], xyxy[2:])
@@ -144,7 +148,7 @@ def first_name(subject: Subject, evidence: Evidence, traces: FrameIndex) -> Scor
     Both have nearly the same image box and one cluster. A box that only lies in the other is another
     object: a person before a truck.
     """
-    camera = traces.camera(subject.camera)
+    camera = traces.result.camera(subject.camera)
     if camera is None or camera.detections is None or camera.fusion is None or evidence.main < 0:
         return None
     detections, fusion, xyxy = camera.detections, camera.fusion, subject.xyxy
@@ -205,16 +209,7 @@ def find_fused(subject: Subject, evidence: Evidence, traces: FrameIndex) -> int:
 
 def opinion_on(result: FrameResult, row: int) -> str:
     """Return the opinion of the cameras on an object that is not ours; empty: no opinion."""
-    key = "object", row
-    text = next(
-        (
-            explanation.text
-            for explanation in result.explanations
-            if (explanation.subject, explanation.row) == key
-        ),
-        "",
-    )
-    return text.partition(": ")[2]
+    return texts_by_row(result.explanations, "object").get(row, "").partition(": ")[2]
 
 
 def _reported_object(
@@ -226,7 +221,7 @@ def _reported_object(
     camera, detection, cluster = objects.camera[row], int(objects.detection[row]), int(objects.cluster[row])
     also: list[int] = []
     if camera:
-        _, fusion = camera_and_fusion(result, camera)
+        fusion = result.fusion(camera)
         assert fusion is not None
         same = (fusion.cluster_decision == Decision.MATCHED) & (fusion.cluster_detection == detection)
         also = [other for other in np.flatnonzero(same).tolist() if other != cluster]
@@ -270,8 +265,7 @@ def _represents(subject: Subject, traces: FrameIndex, row: int, part: ClusterPar
         return True
     objects = traces.result.objects
     assert objects is not None
-    camera = traces.camera(objects.camera[row])
-    owner = -1 if camera is None else int(traces.owners(camera)[objects.detection[row]])
+    owner = traces.owner_of(objects.camera[row], int(objects.detection[row]))
     mates = list(traces.mates(part.cluster, subject.row))
     if owner == subject.row or not mates:
         return True
@@ -285,7 +279,7 @@ def _objects_at_place(subject: Subject, traces: FrameIndex) -> Iterator[int]:
     objects, points = traces.result.objects, traces.result.frame.points
     assert objects is not None
     if subject.kind in ("detection", "pixel"):
-        camera = traces.camera(subject.camera)
+        camera = traces.result.camera(subject.camera)
         for row in range(len(objects)):
             box = projected_box(objects.boxes.chosen([row]), camera.camera) if camera is not None else None
             if box is None or subject.xyxy is None:

@@ -11,7 +11,7 @@ from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model.decisions import pair_kind
 from bevviz.model.reasons import Reason, ReasonKind, facts_of, kind_of
 from bevviz.model.results import ClusterState, Decision, DetectionState, FrameResult, Fusion, Opinion
-from bevviz.why.evidence import MOST, Candidate, Evidence, ReportedObject, camera_and_fusion
+from bevviz.why.evidence import MOST, Candidate, Evidence, ReportedObject
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FEW, PART, FrameIndex
 from bevviz.why.ideal import StageSet
@@ -222,8 +222,7 @@ class _Decider:
             return None if best.kept else self._weakness(best)
         if best is None or not best.kept:
             return None
-        _, fusion = camera_and_fusion(self.result, best.camera)
-        if fusion is None:
+        if (fusion := self.result.fusion(best.camera)) is None:
             return ReasonKind.NOT_FUSED
         if evidence.main < 0:
             if best.decision is Decision.NO_CLUSTER:
@@ -305,8 +304,7 @@ class _Decider:
     def _refusal(self, best: Candidate) -> ReasonKind:
         """Return the reason why a cluster and a detection were not matched."""
         evidence = self.evidence
-        _, fusion = camera_and_fusion(self.result, best.camera)
-        if fusion is None:
+        if (fusion := self.result.fusion(best.camera)) is None:
             return ReasonKind.NOT_FUSED
         kind = pair_kind(fusion, self.result.config, best.row, evidence.main)
         if kind is ReasonKind.MATCHED:  # the object counts for another one in the cluster
@@ -325,9 +323,7 @@ class _Decider:
         evidence = self.evidence
         if fusion.cluster_decision[evidence.main] != Decision.MATCHED:
             return False
-        camera_result, _ = camera_and_fusion(self.result, camera)
-        owner = self.traces.owners(camera_result)[fusion.cluster_detection[evidence.main]]
-        return int(owner) in evidence.mates
+        return self.traces.owner_of(camera, int(fusion.cluster_detection[evidence.main])) in evidence.mates
 
     def _fragment(self, inside: int) -> ReasonKind | None:
         """Return the stage that took most of an object, None if its cluster holds at least half of it."""
@@ -354,8 +350,7 @@ class _Decider:
         if not best.kept:  # The fusion may give noise to a detection, but never ground.
             is_ground = lost and self.ground >= max(evidence.noise, evidence.aside_points, FEW)
             return ReasonKind.GROUND if is_ground else self._weakness(best)
-        _, fusion = camera_and_fusion(self.result, best.camera)
-        if fusion is None:
+        if self.result.fusion(best.camera) is None:
             return ReasonKind.NOT_FUSED
         if best.decision is Decision.NO_CLUSTER or best.cluster < 0:
             return ReasonKind.NO_POINTS if evidence.raw < FEW else self._unclustered()

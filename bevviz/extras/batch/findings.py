@@ -111,7 +111,7 @@ def _others(traces: FrameIndex, findings: Sequence[Finding]) -> Iterator[Row]:
         if selection is None:
             yield {**_outcome(finding), "object": finding.number}  # A lasting anomaly is one object.
         elif selection.detection is not None:
-            camera = traces.camera(selection.camera)
+            camera = traces.result.camera(selection.camera)
             assert camera is not None and camera.detections is not None
             row, x, y = selection.detection, *_in_points_frame(traces.result, finding)
             values: Row = {

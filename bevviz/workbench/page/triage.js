@@ -2,8 +2,8 @@
 
 import { seconds } from "./page_state.js";
 
-/** @import { Entry, HandledFinding, Note, Remark, Sight } from "./types" */
-/** @typedef {Omit<Sight, "frame"> & { frame: number | null, chip?: Remark["chip"] }} RowSight a frame of a row */
+/** @import { Entry, FindingFrame, HandledFinding, Note, Remark } from "./types" */
+/** @typedef {Omit<FindingFrame, "frame"> & { frame: number | null, chip?: Remark["chip"] }} RowSight a frame of a row */
 
 /**
  * A row of the list: a finding of the server, or a note.
