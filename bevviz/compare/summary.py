@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from io import StringIO
 from operator import attrgetter
 from pathlib import Path
 
@@ -26,7 +24,6 @@ from bevviz.evaluate.differences import (
 )
 from bevviz.model.protocols import Observer
 from bevviz.support import table
-from bevviz.support.files import save_text
 from bevviz.support.json_form import json_form
 from bevviz.support.text import fenced
 
@@ -300,13 +297,9 @@ class ComparisonSummary(Observer[ComparedFrame]):
             UserError: the file cannot be written.
         """
         header = ("frame", "stamp", "change", "class_a", "class_b", "x", "y", "z", "distance", "iou")
-        file = StringIO()
-        writer = csv.writer(file)
-        writer.writerow(header)
         of_object = attrgetter(*header[2:])
-        for frame in self.frames:
-            writer.writerows((frame.frame, frame.stamp, *of_object(row)) for row in frame.objects)
-        save_text(path, file.getvalue(), "--csv")
+        rows = [(one.frame, one.stamp, *of_object(row)) for one in self.frames for row in one.objects]
+        table.save_csv(path, [header, *rows], "--csv")
 
 
 def parameters(config: Mapping[str, str]) -> Iterator[str]:

@@ -1,11 +1,15 @@
-"""Text tables for a terminal and for Markdown. The first row is the heading."""
+"""Text tables for a terminal, for Markdown and as CSV. The first row is the heading."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import csv
+from collections.abc import Iterable, Iterator, Sequence
+from io import StringIO
+from pathlib import Path
 
 from bevviz.errors import printable
 from bevviz.support import text
+from bevviz.support.files import save_text
 
 Rows = Sequence[Sequence[str]]
 
@@ -35,6 +39,17 @@ def markdown(rows: Rows, align: str = "") -> str:
     return "\n".join(
         "|" + "".join(f" {cell} |" if cell else " |" for cell in row) for row in [head, rules, *body]
     )
+
+
+def save_csv(target: Path, rows: Iterable[Sequence[object]], option: str) -> None:
+    """Write rows as CSV, see ``save_text``.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    file = StringIO()
+    csv.writer(file).writerows(rows)
+    save_text(target, file.getvalue(), option)
 
 
 def _default(rows: Rows) -> str:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import asdict, dataclass
-from typing import Any, Self
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
 from bevviz.errors import UserError
 from bevviz.model import geometry
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import FrameResult, Tracks
 from bevviz.stages.robot_results import in_points_frame
+from bevviz.support.json_form import json_form
 from bevviz.why.selection import Selection
 from bevviz.why.subject import Subject
 
@@ -21,6 +23,7 @@ GAP = 5  # frames over which a place can mean the same object
 SAME_BOX = 0.3  # IoU of the image boxes of one detection in two results
 
 
+@json_form
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Identity:
     """Everything that tells an object apart in other frames.
@@ -50,25 +53,18 @@ class Identity:
     def __str__(self) -> str:
         return json.dumps({key: value for key, value in asdict(self).items() if value not in ("", (), -1)})
 
-    @classmethod
-    def parse(cls, text: str) -> Self:
+    @staticmethod
+    def parse(text: str) -> Identity:
         """Return the identity of a text that ``str`` made.
 
         Raises:
             UserError: the text is not valid.
         """
-        try:
-            values: dict[str, Any] = json.loads(text)
-            values |= {key: tuple(map(float, values.get(key, ()))) for key in ("at", "box")}
-            identity = cls(**values)
-            lengths = len(identity.at) in (0, 3) and len(identity.box) in (0, 4)
-            texts = (identity.kind, identity.label, identity.id, identity.camera, identity.place)
-            if not lengths or not all(isinstance(one, str) for one in texts):
-                raise ValueError
-            int(identity.frame), int(identity.track)
-        except (ValueError, TypeError, AttributeError):
-            raise UserError(f"'{text}' is nothing that can be asked about") from None
-        return identity
+        with suppress(ValidationError):
+            identity = _FORM.validate_json(text)
+            if len(identity.at) in (0, 3) and len(identity.box) in (0, 4):
+                return identity
+        raise UserError(f"'{text}' is nothing that can be asked about")
 
     @property
     def name(self) -> str:
@@ -76,6 +72,9 @@ class Identity:
         if self.place:
             return self.label
         return f"the {self.label}{f' (track {self.track})' if self.track >= 0 else ''}"
+
+
+_FORM = TypeAdapter(Identity)
 
 
 def identify(

@@ -68,13 +68,9 @@ class Selection:
     @classmethod
     def of(cls, kind: str, row: int = -1, camera: str = "", place: Sequence[float] = ()) -> Self:
         """Return the selection of a row or of a place."""
-        if kind == "pixel":
-            return cls(box=tuple(place), camera=camera)
-        if kind == "point":
-            return cls(point=tuple(place), camera=camera)
-        if kind == "cell":
-            return cls(cell=tuple(map(int, place)), camera=camera)
-        return cls(camera=camera, **{kind: row})  # type: ignore[arg-type]
+        value = row if kind in ROWS else tuple(map(int, place)) if kind == "cell" else tuple(place)
+        field = "box" if kind == "pixel" else kind
+        return cls(camera=camera, **{field: value})  # type: ignore[arg-type]
 
     @classmethod
     def parse(cls, text: str) -> Self:
@@ -92,6 +88,4 @@ class Selection:
         known = kind in ROWS or kind in PLACES
         if not known or len(numbers) != PLACES.get(kind, 1) or not np.isfinite(numbers).all():
             raise UserError(f"'{text}' is nothing that can be asked about")
-        if kind in PLACES:
-            return cls.of(kind, camera=camera, place=numbers)
-        return cls.of(kind, int(numbers[0]), camera)
+        return cls.of(kind, int(numbers[0]), camera, numbers)

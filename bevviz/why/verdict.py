@@ -168,12 +168,10 @@ class _Decider:
 
     def _by_cameras(self) -> tuple[ReasonKind, bool]:
         """Return the reason with cameras alone, where a kept detection is reported."""
-        best = self.evidence.best
         if not detector_ran(self.result, self.subject.camera):
             return ReasonKind.NOT_RUN, False
-        if best is None or not self.subject.accepts(best.name):
-            return ReasonKind.NOT_DETECTED, False
-        return (ReasonKind.REPORTED, True) if best.kept else (self._weakness(best), False)
+        loss = self._detector_loss()
+        return loss or ReasonKind.REPORTED, loss is None
 
     def _flaw(self, named: ReportedObject) -> ReasonKind:
         """Return the fault of a reported object, REPORTED without a fault."""
@@ -217,9 +215,7 @@ class _Decider:
             named = evidence.named
             if named is not None and named.own and not self.subject.accepts(named.name):
                 return ReasonKind.MISNAMED
-            if best is None or not self.subject.accepts(best.name):
-                return ReasonKind.NOT_DETECTED
-            return None if best.kept else self._weakness(best)
+            return self._detector_loss()
         if best is None or not best.kept:
             return None
         if (fusion := self.result.fusion(best.camera)) is None:
@@ -239,8 +235,7 @@ class _Decider:
                 return None
             if evidence.aside is None or evidence.aside_points < evidence.noise:
                 return self._noise()
-            is_small = evidence.aside.state == ClusterState.TOO_SMALL
-            return ReasonKind.TOO_SMALL if is_small else ReasonKind.TOO_LARGE
+            return kind_of(evidence.aside.state)
         part = evidence.part(evidence.main)
         if evidence.mates or evidence.purity < MOST:
             return ReasonKind.MERGED
@@ -269,10 +264,10 @@ class _Decider:
             return ReasonKind.NOT_FUSED
         if not evidence.in_view:
             return ReasonKind.OUT_OF_VIEW
-        best = evidence.best
-        if best is None or not subject.accepts(best.name):
-            return ReasonKind.NOT_DETECTED
-        return self._refusal(best) if best.kept else self._weakness(best)
+        if (loss := self._detector_loss()) is not None:
+            return loss
+        assert evidence.best is not None
+        return self._refusal(evidence.best)
 
     def _without_points(self) -> ReasonKind:
         """Return the reason for a subject without points."""
@@ -284,13 +279,20 @@ class _Decider:
         evidence = self.evidence
         aside = evidence.aside
         if aside is not None and evidence.aside_points >= max(evidence.noise, self.ground):
-            return ReasonKind.TOO_SMALL if aside.state == ClusterState.TOO_SMALL else ReasonKind.TOO_LARGE
+            return kind_of(aside.state)
         ground = self.ground or (len(evidence.ground) if not evidence.noise else 0)
         return ReasonKind.GROUND if ground and ground >= evidence.noise else self._noise()
 
     def _noise(self) -> ReasonKind:
         """Return the reason for points in no cluster. Only for our clustering the cause is known."""
         return ReasonKind.NOISE if self.traces.origin("clustering").ours else ReasonKind.NO_CLUSTER
+
+    def _detector_loss(self) -> ReasonKind | None:
+        """Return how the detector lost the subject; None: it kept a detection of a right class."""
+        best = self.evidence.best
+        if best is None or not self.subject.accepts(best.name):
+            return ReasonKind.NOT_DETECTED
+        return None if best.kept else self._weakness(best)
 
     def _weakness(self, best: Candidate) -> ReasonKind:
         """Return the reason for a detection that was not kept.

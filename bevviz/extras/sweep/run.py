@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
 import re
@@ -10,7 +9,6 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
-from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +23,6 @@ from bevviz.model.frame import F64, Frame
 from bevviz.model.results import FrameResult
 from bevviz.pipeline.session import Variants, check_same_frames
 from bevviz.support import table
-from bevviz.support.files import save_text
 from bevviz.support.json_form import json_form
 
 MOST = 500  # combinations of values, at most
@@ -342,9 +339,7 @@ class Sweep:
         kinds = {"tp": "true", "fp": "false", "fn": "missed"}
         header = [parameter.key for parameter in self.parameters] + ["frames", *names]
         header += [f"{name} {kind}" for name in classes for kind in kinds]
-        file = StringIO()
-        writer = csv.writer(file)
-        writer.writerow(header)
+        rows: list[Sequence[object]] = [header]
         for values, outcome in self.outcomes.items():
             metrics = outcome.metrics
             class_counts = outcome.score.classes
@@ -352,8 +347,8 @@ class Sweep:
                 class_counts.get(name, Counter())[kind] for name in classes for kind in kinds.values()
             ]
             rounded = (f"{metrics.get(name, math.nan):.6g}" for name in names)
-            writer.writerow([*values, outcome.frames, *rounded, *by_class])
-        save_text(path, file.getvalue(), "--csv")
+            rows.append([*values, outcome.frames, *rounded, *by_class])
+        table.save_csv(path, rows, "--csv")
 
 
 def _number(name: str, value: float) -> str:
