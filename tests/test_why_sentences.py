@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bevviz.config import load
-from bevviz.model.reasons import ReasonKind, Scored, StageOwner
+from bevviz.model.reasons import ReasonKind, Scored, StageOwner, scored
 from bevviz.model.results import ClusterState, Decision, Detections, DetectionState, Failure, Pair
 from bevviz.why.evidence import Candidate, ClusterPart, Evidence, ReportedObject
 from bevviz.why.frame_index import Fate
@@ -111,13 +111,15 @@ def sentence(
         clusters=SimpleNamespace(count=np.full(10, 300)),
         failures=of_result.get("failures", ()),
         cameras=(camera,),
+        camera=lambda name: camera if name == "zed" else None,
+        fusion=lambda name: camera.fusion if name == "zed" else None,
     )
     overlap = of_result.get("overlap", 0.0)
     traces: Any = SimpleNamespace(
         result=result,
-        camera=lambda name: camera if name == "zed" else None,
         origin=lambda section: StageOwner(section, **{"topic" if by.startswith("/") else "function": by}),
-        owners=lambda _: np.array([0, 1]),
+        owner_of=lambda name, row: (0, 1)[row] if name == "zed" else -1,
+        scored=lambda _, row: scored(camera.detections, row),
         truth=(CAR, VAN),
         fate=of_result.get("fates", np.full(540, Fate.GROUND)),
         fits=lambda _: SimpleNamespace(overlap=np.array([[overlap], [0]])),
@@ -219,7 +221,7 @@ def test_a_second_name_has_the_box_of_the_first(
     decisions = np.array([Decision.MATCHED, Decision.TAKEN])
     fusion = SimpleNamespace(detection_decision=decisions, detection_cluster=np.array([68, cluster]))
     camera = SimpleNamespace(detections=detections, fusion=fusion)
-    traces: Any = SimpleNamespace(camera=lambda _: camera, result=SimpleNamespace(config=load()))
+    traces: Any = SimpleNamespace(result=SimpleNamespace(camera=lambda _: camera, config=load()))
     subject = Subject("detection", f"the {name} 0.59", name, frozenset({name}), 1, "zed", boxes[1])
     evidence: Any = SimpleNamespace(main=cluster)
     assert first_name(subject, evidence, traces) == (Scored("truck", 0.29) if is_second else None)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
 
 import numpy as np
 import rerun as rr
 
 from bevviz.evaluate.evaluation import Evaluation, page
 from bevviz.evaluate.ground_truth import Truth
-from bevviz.model.frame import Boxes3D
+from bevviz.model.frame import Bool, Boxes3D
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.reasons import Reason
-from bevviz.model.results import FrameResult
+from bevviz.model.results import FrameResult, Objects
 from bevviz.recording import entities
 from bevviz.recording.layers import Layer, Style, callouts, draw
 from bevviz.recording.primitives import document, transform
@@ -21,8 +20,6 @@ from bevviz.recording.writer import SCALAR_WAIT, Writer
 from bevviz.support.colors import TRUTH_COLORS
 from bevviz.support.text import markdown
 
-# Outcome, boxes, rows with this outcome, names of all boxes.
-BoxGroup: TypeAlias = tuple[str, Boxes3D, Sequence[int], Sequence[str]]
 _WRONG = ("missed", "false")  # outcomes whose objects have marks
 
 
@@ -53,14 +50,10 @@ class EvaluationRecorder(Observer[FrameResult]):
         writer, frame = self._writer, result.frame
         writer.begin(frame.index, frame.stamp, frame.received)
         _, truth, matches = self._evaluation.last
-        groups: list[BoxGroup] = [
-            ("missed", truth.boxes, np.flatnonzero(matches.missed).tolist(), truth.labels)
-        ]
-        if (objects := result.objects) is not None:
-            for outcome, is_own in (("false", matches.false), ("true", matches.true)):
-                groups.append((outcome, objects.boxes, np.flatnonzero(is_own).tolist(), objects.names))
-        groups = [group for group in groups if group[2]]
-        self._boxes(result, groups)
+        objects = result.objects or Objects.empty()
+        self._boxes(result, "missed", truth.boxes, matches.missed, truth.labels)
+        self._boxes(result, "false", objects.boxes, matches.false, objects.names)
+        self._boxes(result, "true", objects.boxes, matches.true, objects.names)
         judged = self._evaluation.now
         texts_by_outcome = {"missed": judged.missed, "false": judged.false, "true": judged.true}
         for outcome, texts in texts_by_outcome.items():
@@ -70,20 +63,24 @@ class EvaluationRecorder(Observer[FrameResult]):
         writer.lines(entities.EVALUATE_LOG, wrong)
         writer.end()
 
-    def _boxes(self, result: FrameResult, groups: Sequence[BoxGroup]) -> None:
-        """Log the boxes, with names under the pointer."""
-        for outcome, boxes, rows, names in groups:
-            chosen, path = boxes.chosen(rows), entities.JUDGED.path(outcome)
-            causes = self._evaluation.causes if outcome == "false" else {}
-            labels = [f"{outcome}: {names[row]}{_cause(causes, row)}" for row in rows]
-            distances = chosen.distance.tolist()
-            says = [f"{label}, {metres:.1f} m away" for label, metres in zip(labels, distances, strict=True)]
-            color, pose = TRUTH_COLORS[outcome], transform(result.frame.pose)
-            draw(
-                self._writer,
-                Layer(path, chosen, Style(color, 0.5, labels=False), labels, frame=pose),
-                *callouts(path, chosen, says, (), [color] * len(rows)),
-            )
+    def _boxes(
+        self, result: FrameResult, outcome: str, boxes: Boxes3D, is_own: Bool, names: Sequence[str]
+    ) -> None:
+        """Log the boxes of an outcome, with names under the pointer."""
+        rows = np.flatnonzero(is_own).tolist()
+        if not rows:
+            return
+        chosen, path = boxes.chosen(rows), entities.JUDGED.path(outcome)
+        causes = self._evaluation.causes if outcome == "false" else {}
+        labels = [f"{outcome}: {names[row]}{_cause(causes, row)}" for row in rows]
+        distances = chosen.distance.tolist()
+        says = [f"{label}, {metres:.1f} m away" for label, metres in zip(labels, distances, strict=True)]
+        color, pose = TRUTH_COLORS[outcome], transform(result.frame.pose)
+        draw(
+            self._writer,
+            Layer(path, chosen, Style(color, 0.5, labels=False), labels, frame=pose),
+            *callouts(path, chosen, says, (), [color] * len(rows)),
+        )
 
     def end(self) -> None:
         """Log the tables of the whole run."""

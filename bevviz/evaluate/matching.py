@@ -297,18 +297,19 @@ def _judged_detections(result: CameraResult, truth: Truth) -> Iterator[JudgedObj
 
 
 def image_boxes_of(truth: Truth, camera: Camera) -> F32:
-    """Return (K, 4) image boxes of the labels in a camera with a pose.
+    """Return (K, 4) image boxes of the labels in a camera.
 
-    They are labelled, or enclose the visible part of the projected 3D box. NaN if the box is not visible.
+    They are labelled, or enclose the visible part of the projected 3D box. NaN if the box is not visible, or
+    the camera has no pose.
     """
+    boxes = np.full((len(truth.labels), 4), np.nan, np.float32)
+    if camera.intrinsics is None or camera.camera_from_points is None:
+        return boxes
     if truth.image is not None and truth.camera is not None and truth.camera.name == camera.name:
         return truth.image.xyxy
-    assert camera.intrinsics is not None
-    assert camera.camera_from_points is not None
     corners = geometry.apply(camera.camera_from_points, geometry.corners(truth.boxes).reshape(-1, 3))
     uv, depth = geometry.project(corners, camera.intrinsics)
     uv, ahead = uv.reshape(-1, 8, 2), depth.reshape(-1, 8).min(axis=1) > geometry.MIN_DEPTH
-    boxes = np.full((len(ahead), 4), np.nan, np.float32)
     size = np.array([camera.intrinsics.width, camera.intrinsics.height], np.float32)
     inside = np.clip(uv[ahead], -0.5, size - 0.5)
     boxes[ahead] = np.hstack([inside.min(axis=1), inside.max(axis=1)])

@@ -9,12 +9,11 @@ import numpy as np
 from bevviz.model import geometry
 from bevviz.model.frame import F32, I32, I64
 from bevviz.model.results import ClusterState, FrameResult
-from bevviz.stages.visibility import share_in_image
 from bevviz.support.numba_kernel import kernel
 from bevviz.why.evidence import Candidate, ClusterPart, Evidence
 from bevviz.why.frame_index import FEW, PART, Fate, FrameIndex
 from bevviz.why.merged_clusters import LOOKED_AT, find_mates, least_distance, separation
-from bevviz.why.subject import IN_VIEW, Subject
+from bevviz.why.subject import Subject
 from bevviz.why.subject_matches import find_candidates, find_reported_object, sort_candidates
 
 NEARER = 0.5  # metres by which a return must be nearer to hide the subject
@@ -71,13 +70,13 @@ def collect_evidence(subject: Subject, traces: FrameIndex) -> Evidence:
         front=int(np.bincount(hiding).argmax()) if len(hiding) else -1,
         candidates=candidates,
         named=named,
-        mates=tuple(row for row, _, _ in mates),
-        others=tuple((name, count) for _, name, count in mates),
+        mates=tuple(other.row for other, _ in mates),
+        others=tuple((other.name, count) for other, count in mates),
         gap=shared[0],
         finer=shared[1],
         joined_by=shared[2],
         apart=_largest_gap(result, parts),
-        in_view=bool(candidates) or _in_view(subject, traces),
+        in_view=bool(candidates) or traces.in_view(subject),
     )
 
 
@@ -187,15 +186,3 @@ def _largest_gap(result: FrameResult, parts: Sequence[ClusterPart]) -> float:
         return float("nan")
     first, second = (result.obstacles[result.clusters.labels == part.cluster] for part in kept[:2])
     return least_distance(first, second)
-
-
-def _in_view(subject: Subject, traces: FrameIndex) -> bool:
-    """Return whether a camera has the subject in its image. True if no camera has a pose."""
-    placed = [c.camera for c in traces.result.cameras if c.camera.intrinsics is not None]
-    if all(camera.camera_from_points is None for camera in placed):
-        return True
-    if subject.kind == "truth":
-        return bool((traces.shown[subject.row] >= IN_VIEW).any())
-    if subject.box is not None:
-        return any(share_in_image(subject.box, camera)[0] >= IN_VIEW for camera in placed)
-    return True

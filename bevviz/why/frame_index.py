@@ -13,12 +13,12 @@ from bevviz.evaluate import MIN_HITS, RANGE, Matches, Truth, exemptions, judge, 
 from bevviz.model import geometry
 from bevviz.model.box_points import rows_in_rectangles
 from bevviz.model.decisions import unmatched_detections
-from bevviz.model.frame import F32, I32, I64, U8, U16, Bool, Boxes3D
+from bevviz.model.frame import F32, F64, I32, I64, U8, U16, Bool, Boxes3D
 from bevviz.model.reasons import Reason, Scored, StageOwner, owner_of, scored
 from bevviz.model.results import CameraResult, Decision, FrameResult
 from bevviz.stages.visibility import image_boxes, share_in_image
 from bevviz.why.detection_fits import Fits, find_fits
-from bevviz.why.subject import FOOT, MARGIN, Subject, points_in_box, points_in_boxes
+from bevviz.why.subject import FOOT, IN_VIEW, MARGIN, Subject, points_in_box, points_in_boxes
 
 FEW = 3  # fewer points than this count as none
 CORE = 0.5  # share of a detection's width and height that is its middle
@@ -334,13 +334,29 @@ class FrameIndex:
         return np.bincount(self.cluster[clustered & known], minlength=number) * 2 >= np.maximum(whole, 1)
 
     @cached_property
-    def shown(self) -> F32:
-        """(K, cameras) share of each object of the ground truth that is inside each camera's image."""
-        share = np.zeros((len(self.truth), len(self.result.cameras)), np.float32)
+    def shown(self) -> Mapping[str, F64]:
+        """(K,) share of each object of the ground truth that is inside the image, by camera with a pose."""
         boxes = Boxes3D.joined([subject.box for subject in self.truth if subject.box is not None])
-        for column, camera in enumerate(self.result.cameras):
-            share[:, column] = share_in_image(boxes, camera.camera)
-        return share
+        return {
+            c.camera.name: share_in_image(boxes, c.camera)
+            for c in self.result.cameras
+            if c.camera.intrinsics is not None and c.camera.camera_from_points is not None
+        }
+
+    def in_view(self, subject: Subject, camera: str = "") -> bool:
+        """Return whether a camera has a subject in its image. Every subject is, where no camera has a pose.
+
+        Args:
+            subject: the subject.
+            camera: name of the camera; empty: any camera.
+        """
+        names = [name for name in self.shown if camera in ("", name)]
+        if not names or subject.box is None:
+            return True
+        if subject.kind == "truth":
+            return any(self.shown[name][subject.row] >= IN_VIEW for name in names)
+        views = [c.camera for c in self.result.cameras if c.camera.name in names]
+        return any(share_in_image(subject.box, view)[0] >= IN_VIEW for view in views)
 
     def labels(self, row: int) -> I32:
         """Return the cluster of each obstacle voxel of an object of the ground truth, -1: noise."""
@@ -378,7 +394,7 @@ class FrameIndex:
         if name not in self._fits:
             names = {name: [subject.accepts(name) for subject in self.truth] for name in {*detections.names}}
             accepted = np.array([names[name] for name in detections.names], np.bool_)
-            self._fits[name] = find_fits(detections, *self._image_boxes(camera), accepted)
+            self._fits[name] = find_fits(detections, *self.image_boxes(camera), accepted)
         return self._fits[name]
 
     def owners(self, camera: CameraResult) -> I64:
@@ -396,14 +412,13 @@ class FrameIndex:
         assert result is not None and result.detections is not None
         return scored(result.detections, detection)
 
-    def _image_boxes(self, camera: CameraResult) -> tuple[F32, F32]:
+    def image_boxes(self, camera: CameraResult) -> tuple[F32, F32]:
         """Return (K, 4) projected boxes of the ground truth, and the image boxes around their points."""
         name = camera.camera.name
         if name not in self._truth_boxes:
-            column = [c.camera.name for c in self.result.cameras].index(name)
             whole = np.full((len(self.truth), 4), np.nan, np.float32)
             seen = whole.copy()
-            truth, shown = self.labels_in_evaluate, np.flatnonzero(self.shown[:, column] > 0)
+            truth, shown = self.labels_in_evaluate, np.flatnonzero(self.shown.get(name, np.zeros(0)) > 0)
             if truth is not None and len(shown):
                 around = image_boxes(truth.boxes.chosen(shown), camera.camera)
                 is_whole = np.isfinite(around).all(axis=1)

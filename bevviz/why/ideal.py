@@ -90,12 +90,14 @@ class IdealStages:
 
     def _own_detection(self, camera: CameraResult, row: int) -> int:
         """Return the kept detection of an object with a right class, -1: none."""
-        detections, subject = camera.detections, self._traces.truth[row]
-        if detections is None or camera.uv is None:
-            return -1
-        overlap = np.nan_to_num(
-            geometry.iou(_image_boxes(self._traces, camera.camera)[[row]], detections.xyxy)[0]
+        detections, subject, truth = (
+            camera.detections,
+            self._traces.truth[row],
+            self._traces.labels_in_evaluate,
         )
+        if detections is None or camera.uv is None or truth is None:
+            return -1
+        overlap = np.nan_to_num(geometry.iou(image_boxes_of(truth, camera.camera)[[row]], detections.xyxy)[0])
         accepted = np.array([subject.accepts(name) for name in detections.names], np.bool_)
         overlap[~detections.kept | ~accepted] = 0
         return int(overlap.argmax()) if overlap.max(initial=0.0) >= LINK else -1
@@ -154,7 +156,9 @@ def _with_own_detections(
     traces: FrameIndex, rows: tuple[int, ...], camera: Camera, detections: Detections
 ) -> Detections:
     """Return the detections with an ideal one of each object in the image, in place of its own ones."""
-    boxes = _image_boxes(traces, camera)
+    truth = traces.labels_in_evaluate
+    assert truth is not None
+    boxes = image_boxes_of(truth, camera)
     shown = [row for row in rows if np.isfinite(boxes[row]).all()]
     result, state = traces.result.camera(camera.name), detections.state.copy()
     if result is not None and result.detections is not None and len(result.detections) == len(detections):
@@ -162,15 +166,6 @@ def _with_own_detections(
     names = [_name(traces, row, detections) for row in shown]
     own = Detections.of_boxes(boxes[shown].astype(np.float32), np.full(len(shown), SURE, np.float32), names)
     return Detections.joined([replace(detections, state=state), own])
-
-
-def _image_boxes(traces: FrameIndex, camera: Camera) -> F32:
-    """Return (K, 4) image boxes of the ground truth in a camera, NaN without a pose or out of view."""
-    truth = traces.labels_in_evaluate
-    assert truth is not None
-    if camera.camera_from_points is None or camera.intrinsics is None:
-        return np.full((len(truth.labels), 4), np.nan, np.float32)
-    return image_boxes_of(truth, camera)
 
 
 def _name(traces: FrameIndex, row: int, detections: Detections) -> str:

@@ -15,29 +15,20 @@ from bevviz.why.evidence import MOST
 from bevviz.why.frame_index import FEW, PART, FrameIndex
 from bevviz.why.subject import LINK, Subject
 
-FINER = (
-    0.9,
-    0.8,
-    0.7,
-    0.6,
-    0.5,
-    0.4,
-    0.3,
-    0.2,
-)  # factors on clustering.eps, tried to separate merged objects
+FINER = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)  # factors on clustering.eps to separate merged objects
 LOOKED_AT = 2000  # points of a large set used for distances
 
 
 def find_mates(
     subject: Subject, traces: FrameIndex, main: int, obstacle_rows: I64
-) -> list[tuple[int, str, int]]:
-    """Return the row, name and number of points of other objects in the subject's main cluster."""
+) -> list[tuple[Subject, int]]:
+    """Return the other objects in the subject's main cluster, with their numbers of points there."""
     clusters, obstacles = traces.result.clusters, traces.result.obstacles
     if main < 0 or clusters is None or obstacles is None:
         return []
     if subject.kind == "truth":
         rows = traces.mates(main, subject.row)
-        return [(row, traces.truth[row].name, traces.voxels_in_cluster(main, row)) for row in rows]
+        return [(traces.truth[row], traces.voxels_in_cluster(main, row)) for row in rows]
     if subject.kind != "detection":
         return []
     members = np.flatnonzero(clusters.labels == main)
@@ -49,7 +40,7 @@ def find_mates(
         theirs = traces.obstacles_of(other)[members]
         alone, apart = mine & ~theirs, theirs & ~mine
         if alone.sum() >= FEW and apart.sum() >= max(FEW, PART * min(int(alone.sum()), 50)):
-            mates.append((other.row, other.name, int(theirs.sum())))
+            mates.append((other, int(theirs.sum())))
     return mates
 
 
@@ -68,7 +59,7 @@ def _same_view(a: Subject, b: Subject) -> bool:
 
 
 def separation(
-    subject: Subject, traces: FrameIndex, main: int, obstacle_rows: I64, mates: Sequence[tuple[int, str, int]]
+    subject: Subject, traces: FrameIndex, main: int, obstacle_rows: I64, mates: Sequence[tuple[Subject, int]]
 ) -> tuple[float, float, Scored | None]:
     """Return the gap in metres between the subject and its mates, the eps that parts them, and the joiner.
 
@@ -85,10 +76,7 @@ def separation(
         return float("nan"), 0.0, None
     points = obstacles[members]
     nearest, gap = ~mine, float("inf")
-    for row, _, _ in mates:
-        other = (
-            traces.truth[row] if subject.kind == "truth" else _detection_of_row(traces, subject.camera, row)
-        )
+    for other, _ in mates:
         theirs = traces.obstacles_of(other)[members]
         theirs &= ~mine if subject.box is not None else np.True_
         alone = mine if subject.box is not None else mine & ~theirs
@@ -122,11 +110,6 @@ def _joining_detection(traces: FrameIndex, cluster: int) -> Scored | None:
     if splits is None or not rows:
         return None
     return traces.scored(splits.camera[rows[0]], int(splits.detection[rows[0]]))
-
-
-def _detection_of_row(traces: FrameIndex, camera: str, row: int) -> Subject:
-    """Return the detection of a row as a subject."""
-    return next(subject for subject in traces.competing if (subject.camera, subject.row) == (camera, row))
 
 
 def _separating_eps(points: F32, mine: Bool, theirs: Bool, traces: FrameIndex) -> float:

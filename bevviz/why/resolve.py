@@ -17,7 +17,7 @@ from bevviz.support.text import did_you_mean
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import CORE, FEW, Fate, FrameIndex, detection_subject
 from bevviz.why.selection import Selection
-from bevviz.why.subject import IN_VIEW, LINK, NOISE, Subject, projected_box
+from bevviz.why.subject import LINK, NOISE, Subject
 from bevviz.why.subject_matches import OVERLAP
 
 PIXELS = 6.0  # pixels, half edge of the box around a selected pixel
@@ -53,9 +53,9 @@ def select_subjects(traces: FrameIndex, selection: Selection) -> list[Subject]:
         return [_pixel(traces, selection)]
     if selection.camera:
         camera_of(traces, selection.camera)
-    subjects = [*_truth_in_view(traces, selection.camera), *_strange_detections(traces, selection.camera)]
-    subjects += _contradicted_objects(traces, selection.camera)
-    subjects += _false_objects(traces, selection.camera)
+    subjects = [subject for subject in traces.truth if traces.in_view(subject, selection.camera)]
+    subjects += _strange_detections(traces, selection.camera)
+    subjects += _wrong_objects(traces, selection.camera)
     if not selection.label:
         return subjects
     truth = result.frame.truth
@@ -215,60 +215,33 @@ def camera_of(traces: FrameIndex, name: str) -> CameraResult:
     return cameras[names.index(name) if name else 0]
 
 
-def _truth_in_view(traces: FrameIndex, camera: str) -> Iterator[Subject]:
-    """Yield the objects of the ground truth that a camera has in view. Without camera poses, yield all."""
-    usable = [
-        column
-        for column, c in enumerate(traces.result.cameras)
-        if camera in ("", c.camera.name)
-        and c.camera.intrinsics is not None
-        and c.camera.camera_from_points is not None
-    ]
-    for subject in traces.truth:
-        if not usable or (traces.shown[subject.row, usable] >= IN_VIEW).any():
-            yield subject
-
-
 def _strange_detections(traces: FrameIndex, camera: str) -> Iterator[Subject]:
     """Yield the detections of no object of the ground truth, without duplicates that NMS suppressed."""
+    objects = traces.result.objects
     for camera_result in traces.result.cameras:
         detections = camera_result.detections
         if detections is None or camera not in ("", camera_result.camera.name):
             continue
         strange = (detections.state != DetectionState.SUPPRESSED) & (traces.owners(camera_result) < 0)
-        strange[_detections_of_false_objects(traces, camera_result)] = False
+        if objects is not None:  # Those that named false objects are subjects with these.
+            own = [row for row in false_reasons(traces) if objects.camera[row] == camera_result.camera.name]
+            strange[objects.detection[own]] = False
         for row in np.flatnonzero(strange).tolist():
             yield detection_subject(traces.result, camera_result, row)
 
 
-def _detections_of_false_objects(traces: FrameIndex, camera: CameraResult) -> list[int]:
-    """Return the detections that named false objects, which are subjects themselves."""
-    objects, name = traces.result.objects, camera.camera.name
+def _wrong_objects(traces: FrameIndex, camera: str) -> Iterator[Subject]:
+    """Yield the objects that a camera contradicts and no label explains, then the false and doubtful ones."""
+    objects, opinions, false = traces.result.objects, traces.result.opinions, false_reasons(traces)
     if objects is None:
-        return []
-    return [int(objects.detection[row]) for row in false_reasons(traces) if objects.camera[row] == name]
-
-
-def _false_objects(traces: FrameIndex, camera: str) -> Iterator[Subject]:
-    """Yield the objects that no ground truth explains, or that look doubtful."""
-    objects = traces.result.objects
-    for row in false_reasons(traces):
-        assert objects is not None
-        if camera in ("", objects.camera[row]):
-            yield object_subject(traces, row)
-
-
-def _contradicted_objects(traces: FrameIndex, camera: str) -> Iterator[Subject]:
-    """Yield the objects that are not ours, not in the ground truth, and contradicted by a camera."""
-    opinions, objects = traces.result.opinions, traces.result.objects
-    if opinions is None or objects is None:
         return
-    real = Boxes3D.joined([subject.box for subject in traces.truth if subject.box is not None])
-    false = false_reasons(traces)  # subjects themselves
-    in_truth = box_overlap.bev_iou(objects.boxes, real).max(axis=1, initial=0) >= OVERLAP
-    for row in np.flatnonzero(opinions.opinion == Opinion.CONTRADICTED).tolist():
-        if not in_truth[row] and row not in false and camera in ("", opinions.camera[row]):
-            yield object_subject(traces, row)
+    if opinions is not None:
+        real = Boxes3D.joined([subject.box for subject in traces.truth if subject.box is not None])
+        in_truth = box_overlap.bev_iou(objects.boxes, real).max(axis=1, initial=0) >= OVERLAP
+        for row in np.flatnonzero((opinions.opinion == Opinion.CONTRADICTED) & ~in_truth).tolist():
+            if row not in false and camera in ("", opinions.camera[row]):
+                yield object_subject(traces, row)
+    yield from (object_subject(traces, row) for row in false if camera in ("", objects.camera[row]))
 
 
 # --- subjects at a place -----------------------------------------------------------------------
@@ -409,14 +382,11 @@ def _truth_at_box(
     traces: FrameIndex, camera: CameraResult, image_box: F32, pixel: bool
 ) -> Iterator[tuple[Subject, float]]:
     """Yield the objects of the ground truth at the selected box, with their fit."""
-    column = [result.camera.name for result in traces.result.cameras].index(camera.camera.name)
+    boxes, _ = traces.image_boxes(camera)
     for subject in traces.truth:
-        if traces.shown[subject.row, column] <= 0 or subject.box is None:
+        if not np.isfinite(boxes[subject.row]).all():
             continue
-        box = projected_box(subject.box, camera.camera)
-        if box is None:
-            continue
-        fit = _fit(image_box, box, pixel)
+        fit = _fit(image_box, boxes[subject.row], pixel)
         if not pixel:
             uv = traces.uv(camera)[traces.place(subject)]
             uv = uv[np.isfinite(uv).all(axis=1)]

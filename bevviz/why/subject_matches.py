@@ -15,6 +15,7 @@ from bevviz.model.results import (
     DetectionState,
     FrameResult,
     Fusion,
+    Objects,
     texts_by_row,
 )
 from bevviz.why.evidence import Candidate, ClusterPart, Evidence, ReportedObject
@@ -201,10 +202,16 @@ def find_fused(subject: Subject, evidence: Evidence, traces: FrameIndex) -> int:
         return -1
     fused = opinions.fused
     if subject.kind == "detection":
-        candidate_keys = {(candidate.camera, candidate.row) for candidate in evidence.candidates}
-        named = zip(fused.camera, fused.detection.tolist(), strict=True)
-        return next((row for row, key in enumerate(named) if key in candidate_keys), -1)
+        return next(_named_by(fused, evidence.candidates), -1)
     return fused.cluster.tolist().index(evidence.main) if evidence.main in fused.cluster else -1
+
+
+def _named_by(objects: Objects, candidates: Sequence[Candidate]) -> Iterator[int]:
+    """Yield the rows of the objects that some detections named."""
+    keys = {(candidate.camera, candidate.row) for candidate in candidates}
+    for row, key in enumerate(zip(objects.camera, objects.detection.tolist(), strict=True)):
+        if key in keys:
+            yield row
 
 
 def opinion_on(result: FrameResult, row: int) -> str:
@@ -246,10 +253,7 @@ def _objects_of_clusters(
     objects = traces.result.objects
     assert objects is not None
     if subject.kind == "detection":
-        candidate_keys = {(candidate.camera, candidate.row) for candidate in candidates}
-        for row, key in enumerate(zip(objects.camera, objects.detection.tolist(), strict=True)):
-            if key in candidate_keys:
-                yield row
+        yield from _named_by(objects, candidates)
         return
     total = len(traces.labels(subject.row)) if subject.kind == "truth" else sum(part.points for part in parts)
     least = 1 if subject.is_place else max(FEW, PART * total)
