@@ -8,6 +8,7 @@ import sys
 from collections import defaultdict
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,6 +20,7 @@ from bevviz.bags.source import MARGIN, SECOND, BagSource
 from bevviz.config import Config, load
 from bevviz.errors import UserError
 from bevviz.extras.demo.bag import _qos
+from bevviz.messages.roles import Roles
 from bevviz.pipeline.session import Session
 from bevviz.report.bag_window import (
     CutContent,
@@ -181,6 +183,14 @@ def test_topics_are_limited_to_what_is_needed_and_named(tmp_path: Path) -> None:
     assert set(made.counts) == needed | {"/state/arm"}
     with pytest.raises(UserError, match=r"--topics /absent: no topic fits"):
         cut_out(path, tmp_path / "none.mcap", at="1", topics=["/absent"])
+
+
+def test_all_inputs_of_the_pipeline_are_needed() -> None:
+    """Also those that only make results of another kind: gravity, and the robot's obstacle points."""
+    names = ("/imu", "/obstacles", "/map", "/rosout")
+    recording: Any = SimpleNamespace(topics=[SimpleNamespace(name=n, metadata_topic="") for n in names])
+    roles = Roles(imus=("/imu",), robot_clouds=("/obstacles",))
+    assert choose_topics(recording, roles, ["/map"]) == ["/imu", "/obstacles", "/map"]
 
 
 def test_nothing_is_left_of_a_bag_that_fails(tmp_path: Path) -> None:

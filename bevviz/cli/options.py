@@ -153,7 +153,7 @@ class TruthOptions:
         """
         from bevviz.evaluate import truth_source
 
-        return truth_source(source.roles, self.truth, self.kitti_labels, len(source.scans))
+        return truth_source(source, self.truth, self.kitti_labels)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -83,25 +83,31 @@ class Truth:
         return np.asarray(np.any(inside, axis=1), bool)
 
 
-def truth_source(roles: Roles, topic: str | None, kitti: Path | None, scans: int) -> TruthLookup | None:
-    """Return a function that returns the ground truth of a frame. None: the bag has no ground truth.
+def truth_source(
+    frames: FrameSource, topic: str | None = None, kitti: Path | None = None
+) -> TruthLookup | None:
+    """Return a function that returns the ground truth of a drive's frames. None: there is no ground truth.
 
     Args:
-        roles: of the bag's topics.
+        frames: a bag, or frames that come with their own ground truth.
         topic: requested Detection3DArray; None: the topic called ground truth.
-        kitti: requested label file or folder.
-        scans: number of scans in the bag. Each one has its label file.
+        kitti: requested label file, or a folder with one for each scan.
 
     Raises:
-        UserError: there is no such topic or file, or the numbers of label files and scans differ.
+        UserError: there is no such topic or file, the numbers of label files and scans differ, or the frames
+            come with their own.
     """
+    roles: Roles | None = getattr(frames, "roles", None)
+    if roles is None and (topic or kitti):
+        option = f"--truth {topic}" if topic else f"--kitti-labels {kitti}"
+        raise UserError(f"{option}: {frames.scene.name} has its own truth, leave it out")
+    if roles is None:
+        return own_truth if frames.scene.truth else None
     if kitti is not None:
         files = label_files(kitti)
-        if len(files) != scans:
-            count = f"{len(files)} label file{'s' * (len(files) > 1)}"
-            raise UserError(
-                f"--kitti-labels {kitti}: {count} and {scans} scans: one for each scan, in order, is needed"
-            )
+        if len(files) != len(frames.scans):
+            count = f"{len(files)} label file{'s' * (len(files) > 1)} and {len(frames.scans)} scans"
+            raise UserError(f"--kitti-labels {kitti}: {count}: one for each scan, in order, is needed")
 
         def of_kitti(frame: Frame) -> Truth | None:
             return truth_of(frame, read_labels(files[frame.index]))
@@ -124,32 +130,26 @@ def truth_source(roles: Roles, topic: str | None, kitti: Path | None, scans: int
 
 
 def truth_in(frames: FrameSource, topic: str | None = None, kitti: Path | None = None) -> TruthLookup:
-    """Return a function that returns the ground truth of a drive's frames.
-
-    Args:
-        frames: a bag, or frames that come with their own ground truth.
-        topic: as in ``truth_source``.
-        kitti: as in ``truth_source``.
+    """Return what ``truth_source`` returns.
 
     Raises:
         UserError: as ``truth_source``, and if there is no ground truth.
     """
+    if (truths := truth_source(frames, topic, kitti)) is not None:
+        return truths
     roles: Roles | None = getattr(frames, "roles", None)
-    if roles is None and (topic or kitti):
-        option = f"--truth {topic}" if topic else f"--kitti-labels {kitti}"
-        raise UserError(f"{option}: {frames.scene.name} has its own truth, leave it out")
     if roles is None:
-        if not frames.scene.truth:
-            raise UserError(f"{frames.scene.name}: there is no ground truth")
-        return lambda frame: None if frame.truth is None else truth_of(frame, frame.truth)
-    truths = truth_source(roles, topic, kitti, len(frames.scans))
-    if truths is None:
-        topics = ", ".join(roles.robot_detections_3d) or "none"
-        raise UserError(
-            f"{frames.scene.name}: no .../ground_truth in it; give --truth TOPIC (Detection3DArray there: "
-            f"{topics}) or --kitti-labels"
-        )
-    return truths
+        raise UserError(f"{frames.scene.name}: there is no ground truth")
+    topics = ", ".join(roles.robot_detections_3d) or "none"
+    raise UserError(
+        f"{frames.scene.name}: no .../ground_truth in it; give --truth TOPIC (Detection3DArray there: "
+        f"{topics}) or --kitti-labels"
+    )
+
+
+def own_truth(frame: Frame) -> Truth | None:
+    """Return the ground truth that a frame comes with."""
+    return None if frame.truth is None else truth_of(frame, frame.truth)
 
 
 def truth_of(frame: Frame, labelled: LabelledBoxes3D) -> Truth:

@@ -384,7 +384,7 @@ def _read(
         if not wanted:
             continue
         with BagSource(drive.paths, config) as source:
-            truths = truth_source(source.roles, topic, kitti, len(source.scans))
+            truths = truth_source(source, topic, kitti)
             for number, side, unit, weight, of_cause in wanted:
                 frame = source.frame(number)
                 truth = truths(frame) if frame is not None and truths is not None else None

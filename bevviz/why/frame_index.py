@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bevviz.evaluate import MIN_HITS, RANGE, Matches, Truth, exemptions, judge, truth_of
+from bevviz.evaluate import MIN_HITS, RANGE, Matches, Truth, exemptions, judge, own_truth
 from bevviz.model import geometry
 from bevviz.model.box_points import rows_in_rectangles
 from bevviz.model.decisions import unmatched_detections
@@ -273,10 +273,7 @@ class FrameIndex:
     @cached_property
     def labels_in_evaluate(self) -> Truth | None:
         """The ground truth in the form that ``evaluate`` judges objects by."""
-        frame = self.result.frame
-        if self._truth is not None or frame.truth is None:
-            return self._truth
-        return truth_of(frame, frame.truth)
+        return own_truth(self.result.frame) if self._truth is None else self._truth
 
     @property
     def is_labelled(self) -> bool:

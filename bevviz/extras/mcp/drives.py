@@ -66,7 +66,7 @@ class AskedDrive:
         """
         source = LabelledSource(paths, config)
         if truth != (None, None):
-            source.truth_of = truth_source(source.roles, *truth, len(source.scans))
+            source.truth_of = truth_source(source, *truth)
         drive = Drive(source, config)
         session = recorded_session(drive, source, paths)
         return cls(words, paths, source, session, drive, truth)

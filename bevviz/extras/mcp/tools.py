@@ -203,7 +203,7 @@ class AgentTools:
 
         configs = [agent_config(asked.drive.config, settings) for settings in (a, b)]
         summary = ComparisonSummary((" ".join(a) or "as opened", " ".join(b)), changes(*configs))
-        truth_of = truth_source(asked.source.roles, *asked.truth, len(asked.drive))
+        truth_of = truth_source(asked.source, *asked.truth)
         run(asked.source, Comparison(configs, truth=truth_of), [summary])
         tree = summary.result()
         sides = [
