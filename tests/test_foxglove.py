@@ -85,9 +85,10 @@ def test_a_clouds_own_pose_is_applied(tmp_path: Path) -> None:
     check(path, lambda scan: geometry.apply(offset, points(scan)[:, :3]))
 
 
-def test_json_gives_the_same_frames_as_protobuf(tmp_path: Path) -> None:
-    """What the SDK wrote as protobuf, by the SDK as JSON."""
-    from google.protobuf.json_format import MessageToDict
+@pytest.mark.parametrize("mapping", ["foxglove", "protobuf"])
+def test_json_gives_the_same_frames_as_protobuf(tmp_path: Path, mapping: str) -> None:
+    """What the SDK wrote as protobuf, as JSON by Foxglove's schemas and as protobuf's own JSON."""
+    from google.protobuf.json_format import MessageToDict, MessageToJson
     from mcap.reader import make_reader
 
     from bevviz.messages.foxglove import parse
@@ -104,7 +105,8 @@ def test_json_gives_the_same_frames_as_protobuf(tmp_path: Path) -> None:
                 )
             parsed = parse(message.data, schema.name, "protobuf", schema.data.decode("latin-1"))
             fields = MessageToDict(parsed, preserving_proto_field_name=True, use_integers_for_enums=True)
-            made[channel.topic].log(json.dumps(_times(fields)).encode(), log_time=message.log_time)
+            text = MessageToJson(parsed) if mapping == "protobuf" else json.dumps(_times(fields))
+            made[channel.topic].log(text.encode(), log_time=message.log_time)
     check(path)
 
 

@@ -10,6 +10,7 @@ import base64
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping
+from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -38,8 +39,13 @@ KINDS = {  # kind of ROS message by Foxglove's type
     "FrameTransforms": "TFMessage",
     "SceneUpdate": "Detection3DArray",
 }
-# Datatype of a PointField by Foxglove's type: uint8 to float64.
-_POINT_FIELD = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
+# Datatype of a PointField by the number of Foxglove's type, and by its name in protobuf's JSON.
+_POINT_FIELD: Mapping[Any, int] = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8} | {
+    kind: number
+    for number, kind in enumerate(
+        ("INT8", "UINT8", "INT16", "UINT16", "INT32", "UINT32", "FLOAT32", "FLOAT64"), 1
+    )
+}
 _AXES = ("x", "y", "z")
 # Keys of metadata; the first that exists is the class.
 _LABELS = ("category", "label", "class", "class_name", "type", "name")
@@ -96,11 +102,14 @@ def _sorted_files(files: Iterable[Any]) -> list[Any]:
     return ordered
 
 
+_HUMP = re.compile(r"(?<=[a-z])[A-Z]")  # protobuf's JSON has frameId
+
+
 class _Fields(SimpleNamespace):
     """Object of JSON. A missing field is None."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(**values)
+        super().__init__(**{_HUMP.sub(lambda match: f"_{match[0].lower()}", k): v for k, v in values.items()})
 
     def __getattr__(self, name: str) -> Any:
         return None
@@ -125,6 +134,13 @@ def _stamp(message: Any) -> int:
     time = getattr(message, "timestamp", None)
     if time is None:
         return 0
+    if isinstance(time, str):  # protobuf's JSON has RFC 3339
+        try:
+            date = datetime.fromisoformat(time)
+        except ValueError:
+            raise ValueError(f"the field 'timestamp' is no time: {time!r:.40}") from None
+        date = date if date.tzinfo else date.replace(tzinfo=UTC)
+        return (date - datetime.fromtimestamp(0, UTC)) // timedelta(microseconds=1) * 1000
     seconds, rest = _first_field(time, "seconds", "sec"), _first_field(time, "nanos", "nsec", "nanosec")
     try:
         return nanoseconds(seconds or 0, rest or 0)
@@ -153,7 +169,11 @@ def _header(message: Any) -> Any:
 def _cloud(message: Any) -> Cloud:
     data, step = np.frombuffer(_data(message), np.uint8), _integer(message, "point_stride")
     fields = [
-        Field(str(field.name), _integer(field, "offset"), _POINT_FIELD.get(_integer(field, "type"), 0))
+        Field(
+            str(field.name),
+            _integer(field, "offset"),
+            _POINT_FIELD.get(field.type if isinstance(field.type, str) else _integer(field, "type"), 0),
+        )
         for field in message.fields or ()
     ]
     layout = point_layout(fields, step)
