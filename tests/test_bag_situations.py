@@ -308,6 +308,20 @@ def test_tables_of_other_recorders_are_no_damage(tmp_path: Path, change: str) ->
         assert not source.warnings
 
 
+def test_transforms_without_a_stamp_hold_when_received(tmp_path: Path) -> None:
+    items = bags.small_items(scans=6)
+    for item in items:
+        if item.topic == "/tf":
+            item.message.transforms[0].header.stamp.sec = 0
+            item.message.transforms[0].header.stamp.nanosec = 0
+        if item.topic == bags.INFO:
+            item.message.header.stamp.sec = item.message.header.stamp.nanosec = 0
+    with BagSource([bags.write(tmp_path / "drive", items)], load()) as source:
+        assert [frame.pose[0, 3] for frame in source] == pytest.approx(range(6))
+        said = [f"{name}: no stamp in the header 6 times" for name in ("/tf", bags.INFO)]
+        assert sorted(warning.partition(", ")[0] for warning in source.warnings) == sorted(said)
+
+
 def test_definitions_with_the_line_ends_of_windows_are_read(tmp_path: Path) -> None:
     text, _ = bags.Messages().store.generate_msgdef("sensor_msgs/msg/PointCloud2", ros_version=2)
     schema = "ros2msg", text.replace("\n", "\r\n").encode()

@@ -378,6 +378,7 @@ class BagSource(Closable):
         for info in self._infos:
             with suppress(MessageError):  # The error is counted when the message itself is handled.
                 handlers[info.topic](info)
+        sync.report.unstamped.clear()  # So are missing stamps.
 
     # Every read begins with these messages. To find them takes time that grows with the length of the drive.
 

@@ -74,11 +74,12 @@ def make_handlers(
     def add_transforms(message: M, static: bool) -> None:
         for transform in read(message, decode_transforms, message.topic, sync.tf.refuse):
             held = message.topic in roles.tf_held
-            sync.add_transform(clocked(message, transform), static, held=held, topic=message.topic)
+            timed = transform if static else clocked(message, transform)
+            sync.add_transform(timed, static, held=held, topic=message.topic)
 
     def clocked(message: M, transform: StampedTransform) -> StampedTransform:
         """Return the transform with the corrected stamp."""
-        stamp = sync.clocks.stamp(message.topic, transform.stamp, message.received)
+        stamp = sync.stamped(message.topic, transform.stamp, message.received)
         return transform if stamp == transform.stamp else replace(transform, stamp=stamp)
 
     def add_image(message: M, camera: CameraRole) -> None:

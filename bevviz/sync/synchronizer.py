@@ -337,8 +337,12 @@ class Synchronizer:
         return results
 
     def _arrived(self, topic: str, stamp: int, received: int) -> int:
-        """Return the stamp to use."""
+        """Return the stamp to use of a message that is paired by its stamp."""
         self._now = received
+        return self.stamped(topic, stamp, received)
+
+    def stamped(self, topic: str, stamp: int, received: int) -> int:
+        """Return the stamp to use. That of a message without one is its time of receipt, which is counted."""
         if stamp == 0:
             self.report.unstamped[topic] += 1
             return received
