@@ -22,6 +22,15 @@ from tests.support import bags, datasets
 LABEL = "Car 0.00 0 0.0 {left} 5 70 30 1.5 1.6 4.0 0.0 1.7 {ahead} -1.57 {score}\n"
 
 
+TABLE = "frame, name, x, y, z, length, width, height, yaw\n{},Cars,12,0,-1,4,1.6,1.5,{}\n"
+TWO_IMAGES = json.dumps(
+    {
+        "images": [{"id": 1, "file_name": "a/1.png"}, {"id": 2, "file_name": "a/001.png"}],
+        "annotations": [{"image_id": 1, "bbox": [1, 2, 3, 4]}, {"image_id": 2, "bbox": [1, 2, 3, 4]}],
+    }
+)
+
+
 def open_with(path: Path, stage: str, file: Path, **more: str) -> bevviz.Drive:
     settings = {"source.results": {"mine": str(file)}, stage: "topic:/results/mine"}
     return bevviz.open(path, set={**settings, **more})
@@ -85,7 +94,7 @@ def test_results_of_coco_are_detections(tmp_path: Path) -> None:
     assert detections is not None and detections.names == ("car",)
     assert detections.xyxy.tolist() == [[10, 5, 50, 25]] and detections.score[0] == np.float32(0.8)
     whole = {
-        "images": [{"id": 77, "file_name": "image_2/000002.png"}],
+        "images": [{"id": 77, "file_name": "image_2/000002_png.rf.0a1b2c3d.jpg"}],
         "categories": [{"id": 9, "name": "van"}],
         "annotations": [{"image_id": 77, "category_id": 9, "bbox": [1, 2, 3, 4]}],
     }
@@ -175,7 +184,15 @@ def test_a_report_has_the_boxes_of_its_result_files(
         ("boxes.json", "[1]", "neither results of nuScenes nor of COCO"),
         ("boxes.json", '{"results": {"a": []}}', "are of nuScenes' samples, which the drive lacks"),
         ("boxes.json", '[{"image_id": 99, "bbox": [0, 0, 1, 1]}]', "is of one of the 3 frames"),
+        (
+            "boxes.json",
+            '[{"image_id": 2, "bbox": [0, 0, 1, 1]}, {"image_id": 3, "bbox": [0, 0, 1, 1]}]',
+            "numbered to 3, those of this drive from 0",
+        ),
+        ("boxes.json", TWO_IMAGES, "a/1.png and a/001.png both end in 1, the number of their frame"),
+        ("000001.txt", "2 0.3 0.5 0.2 0.3\n", "a line has 5 columns, a result of KITTI has 16"),
         ("boxes.csv", "frame,name\n1,car\n", "its columns are frame, name; expected"),
+        ("boxes.csv", TABLE.format(1, 90), "a yaw of 90 is no angle in radians: is it in degrees?"),
         ("boxes.parquet", "no table", "cannot be read as a table"),
         ("boxes.xyz", "", "is not read; expected"),
     ],
@@ -188,6 +205,32 @@ def test_unusable_result_files_are_one_line(
         (tmp_path / name).write_text(text)
     assert main(["info", str(drive), "--results", str(tmp_path / name)]) == 2
     assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_results_of_another_drive_are_told(tmp_path: Path) -> None:
+    drive = datasets.kitti_object(tmp_path / "training")
+    (tmp_path / "boxes.csv").write_text(TABLE.format(1, 0) + "9,Cars,12,0,-1,4,1.6,1.5,0\n")
+    opened = open_with(drive, "objects.method", tmp_path / "boxes.csv")
+    said = "its frames are numbered to 9, those of this drive from 0 to 2: is it of another drive?"
+    assert any(said in warning for warning in opened.warnings)
+
+
+def test_labels_that_no_object_name_fits_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drive, results = datasets.kitti_object(tmp_path / "training"), tmp_path / "preds"
+    results.mkdir()
+    for label in (drive / "label_2").glob("*.txt"):
+        row, _ = label.read_text().splitlines()
+        (results / label.name).write_text(f"{row.replace('Car', 'Cars')} 0.9\n")
+    command = ["evaluate", str(drive), "--results", str(results)]
+    assert main(command) == 0
+    said = "no 'Car' was found, but 3 of 3 have an object named 'cars' within 2 m"
+    out = " ".join(capsys.readouterr().out.split())
+    assert said in out
+    rule = 'source.labels={"Car": ["cars"]}'
+    assert f"--set '{rule}'" in out
+    assert main([*command, "--set", rule, "--json"]) == 0
+    found = capsys.readouterr()
+    assert json.loads(found.out)["metrics"]["recall"] == 1 and said not in found.err
 
 
 def test_a_report_names_result_files_without_their_folder() -> None:

@@ -63,6 +63,7 @@ def folder(tmp_path: Path) -> Path:
         ({"occlusion": "nan"}, "its occlusion is nan"),
         ({"height": "-1"}, "its size is negative: -1.0 1.6 4.0"),
         ({"z": "1e300"}, "its z is 1e+300"),
+        ({"rotation_y": "-90"}, "its rotation_y of -90 is no angle in radians: is it in degrees?"),
     ],
 )
 def test_a_label_of_kitti_is_left_out_with_its_line(folder: Path, changed: Any, why: str) -> None:

@@ -150,6 +150,10 @@ class Recording(Closable):
             return max(int(self._moved(f.times(f.connections)).max(initial=0)) for f in self.files)
         return max(f.span[1] for f in self.files) - 1
 
+    def note(self, text: str) -> None:
+        """Add a warning."""
+        self._notes.append(text)
+
     def _find_jumps(self) -> None:
         """Find jumps of the clock of the log times, and note them."""
         if self._datasets or not is_odd(self.start, self.end):

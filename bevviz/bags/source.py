@@ -423,7 +423,8 @@ class BagSource(Closable):
 
         driver = find_roles(self.recording.topics, self.config.source).driver
         scans = len(self.recording.scan_times(driver)) if driver else 0
-        return open_results(results, self.recording.folder, scans, self.recording.sample_stamps)
+        samples, tell = self.recording.sample_stamps, self.recording.note
+        return open_results(results, self.recording.folder, scans, samples, tell)
 
     def _with_results(self, frame: Frame) -> Frame:
         """Return a frame with the boxes of the result files."""
@@ -437,6 +438,8 @@ class BagSource(Closable):
             except NOT_AS_DOCUMENTED as error:
                 problems.append(f"{file.path}: not as documented ({describe_error(error)})")
                 continue
+            if labelled is not None and self._sync is not None:
+                self._sync.report.note_boxes(labelled)
             if isinstance(labelled, LabelledBoxes3D):
                 boxes.append(labelled)
             elif labelled is not None:

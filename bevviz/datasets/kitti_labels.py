@@ -21,6 +21,7 @@ COLUMNS = (
     *("truncation", "occlusion", "alpha", "image box's left", "image box's top", "image box's right"),
     *("image box's bottom", "height", "width", "length", "x", "y", "z", "rotation_y"),
 )
+TURN = 6.3  # radians of a full turn, rounded
 MIN_FOCAL = 5.0  # pixels; placeholders are the identity, or negative
 
 
@@ -138,6 +139,8 @@ def _why_unusable(kind: str, row: Sequence[float]) -> str:
     size = row[7:10]
     if kind != "DontCare" and min(size) < 0:
         return f"its size is negative: {' '.join(map(str, size))}"
+    if kind != "DontCare" and abs(row[13]) > TURN:
+        return f"its rotation_y of {row[13]:g} is no angle in radians: is it in degrees?"
     return ""
 
 

@@ -6,7 +6,7 @@ import json
 import re
 from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, describe_error, files_in
-from bevviz.datasets.kitti_labels import Calibration, labelled_boxes
+from bevviz.datasets.kitti_labels import TURN, Calibration, labelled_boxes
 from bevviz.errors import UserError, first_line
 from bevviz.messages.foreign_boxes import check_box_count
 from bevviz.messages.topics import Topic
@@ -29,6 +29,7 @@ from bevviz.support.limits import JSON_LIMIT, TABLE_LIMIT
 RESULTS = "/results/"  # topics of result files begin with it
 BOXES_3D, BOXES_2D = "vision_msgs/msg/Detection3DArray", "vision_msgs/msg/Detection2DArray"
 NUMBER = re.compile(r"(\d+)\D*$")
+ROBOFLOW = re.compile(r"_[A-Za-z]+\.rf\.\w+$")  # frame_000012_png.rf.0a1b2c, as Roboflow names copies
 BOX_COLUMNS = ("x", "y", "z", "length", "width", "height", "yaw")
 IMAGE_COLUMNS = ("x0", "y0", "x1", "y1")
 NAME_COLUMNS = ("name", "label", "class", "class_name")
@@ -48,13 +49,15 @@ class ResultFile(ABC):
 
     Attributes:
         topic: topic that the results appear on.
-        frames: numbers of the frames with a result.
+        numbers: numbers of the frames with a result, also of frames that the drive lacks.
+        frames: those of the drive.
     """
 
     is_2d = False
 
     def __init__(self, name: str, path: Path) -> None:
         self.topic, self.path = RESULTS + name, path
+        self.numbers: Collection[int] = ()
         self.frames: Sequence[int] = ()
 
     @property
@@ -89,7 +92,11 @@ class ResultFile(ABC):
 
 
 def open_results(
-    results: Mapping[str, str], drive: Path, scans: int, samples: Mapping[str, int]
+    results: Mapping[str, str],
+    drive: Path,
+    scans: int,
+    samples: Mapping[str, int],
+    tell: Callable[[str], object],
 ) -> list[ResultFile]:
     """Open the files of ``source.results``.
 
@@ -98,11 +105,13 @@ def open_results(
         drive: path of the drive, whose scans may have names.
         scans: number of scans.
         samples: stamp of each sample of nuScenes by token.
+        tell: receives a warning if a file has results of frames beyond the drive.
 
     Raises:
-        UserError: a file is missing, of no known kind, or has no result for any frame.
+        UserError: a file is missing, of no known kind, counts frames from 1, or has no result for any frame.
     """
     opened = []
+    numbered = f"those of this drive from 0 to {scans - 1}"
     for name, text in results.items():
         path = Path(text).expanduser()
         file = _open(name, path, drive, scans, samples)
@@ -110,6 +119,13 @@ def open_results(
             raise UserError(
                 f"--results {path}: no result in it is of one of the {scans} frames of this drive"
             )
+        last = max(file.numbers, default=0)
+        if last == scans and 0 not in file.numbers:
+            raise UserError(
+                f"--results {path}: its frames are numbered to {last}, {numbered}: number them from 0"
+            )
+        if last >= scans:
+            tell(f"--results {path}: its frames are numbered to {last}, {numbered}: is it of another drive?")
         opened.append(file)
     return opened
 
@@ -156,7 +172,7 @@ def _open_as_documented(
         raise UserError(f"--results {path}: is no JSON: {first_line(error)}") from None
     if isinstance(tree, dict) and isinstance(tree.get("results"), dict):
         return NuScenesResults(name, path, tree["results"], samples)
-    return CocoResults(name, path, tree, scans)
+    return CocoResults(name, path, tree, drive, scans)
 
 
 @lru_cache(maxsize=1)
@@ -180,17 +196,20 @@ class KittiResults(ResultFile):
         files = files_in(path, [".txt"]) if path.is_dir() else [path]
         if not files:
             raise UserError(f"--results {path}: no .txt file in it; expected {EXPECTED}")
-        stems = [file.stem for file in files_in(drive / "velodyne", [".bin"])]
-        numbers = {stem: number for number, stem in enumerate(stems)}
+        numbers = _scan_numbers(drive)
         self._files = {}
         for file in files:
             number = numbers.get(file.stem) if numbers else _number(file.stem)
-            if number is not None and number < scans:
+            if number is not None:
                 self._files[number] = file
-        self.frames = sorted(self._files)
+        self.numbers, self.frames = self._files, sorted(n for n in self._files if n < scans)
         self._calibrations = drive / "calib", path.parent / "calib", path.parent.parent / "calib"
         first = files[len(files) // 2]
-        rows = [line.split() for line in read_text(first).splitlines()]
+        rows = [row for line in read_text(first).splitlines() if (row := line.split())]
+        if wrong := [row for row in rows if len(row) < 15]:
+            raise UserError(
+                f"--results {first}: a line has {len(wrong[0])} columns, a result of KITTI has 16"
+            )
         self.is_2d = bool(rows) and all(len(row) > 10 and float(row[8]) <= 0 for row in rows)
 
     def of(self, frame: Frame) -> Labelled | None:
@@ -259,7 +278,7 @@ class CocoResults(ResultFile):
 
     is_2d = True
 
-    def __init__(self, name: str, path: Path, tree: Any, scans: int) -> None:
+    def __init__(self, name: str, path: Path, tree: Any, drive: Path, scans: int) -> None:
         super().__init__(name, path)
         about = tree if isinstance(tree, dict) else {}
         rows = about.get("annotations", about.get("predictions")) if about else tree
@@ -268,13 +287,19 @@ class CocoResults(ResultFile):
         self._names = {int(row["id"]): str(row["name"]) for row in about.get("categories", ())}
         images = {image["id"]: str(image["file_name"]) for image in about.get("images", ())}
         self._rows: dict[int, list[Mapping[str, Any]]] = defaultdict(list)
-        self._folders: dict[int, str] = {}
+        files, numbers = dict[tuple[int, Path], str](), _scan_numbers(drive)
         for row in rows:
-            image = row["image_id"]
-            number = _number(Path(images.get(image, str(image))).stem)
-            if number is not None and number < scans:
-                self._rows[number].append({**row, "folder": Path(images.get(image, "")).parent.name})
-        self.frames = sorted(self._rows)
+            file = images.get(row["image_id"], str(row["image_id"]))
+            stem = ROBOFLOW.sub("", Path(file).stem)
+            number = numbers.get(stem, _number(stem))
+            if number is None:
+                continue
+            if (other := files.setdefault((number, Path(file).parent), file)) != file:
+                raise UserError(
+                    f"--results {path}: {other} and {file} both end in {number}, the number of their frame"
+                )
+            self._rows[number].append({**row, "folder": Path(file).parent.name})
+        self.numbers, self.frames = self._rows, sorted(n for n in self._rows if n < scans)
 
     def of(self, frame: Frame) -> Labelled | None:
         """Return the boxes of a frame. Images in folders are those of the cameras with these names."""
@@ -313,9 +338,13 @@ class TableResults(ResultFile):
             )
         used = ["frame", self._name, *box, *(columns & {"score", "camera"})]
         self._columns = {column: table.column(column).to_numpy() for column in used}
+        if not self.is_2d and (largest := np.abs(self._columns["yaw"]).max(initial=0)) > TURN:
+            raise UserError(
+                f"--results {path}: a yaw of {largest:g} is no angle in radians: is it in degrees?"
+            )
         numbers = self._columns["frame"].astype(np.int64)
-        self._rows = {int(n): np.flatnonzero(numbers == n) for n in np.unique(numbers) if 0 <= n < scans}
-        self.frames = sorted(self._rows)
+        self._rows = {int(n): np.flatnonzero(numbers == n) for n in np.unique(numbers)}
+        self.numbers, self.frames = self._rows, sorted(n for n in self._rows if 0 <= n < scans)
 
     def of(self, frame: Frame) -> Labelled | None:
         """Return the boxes of a frame."""
@@ -347,12 +376,18 @@ def _read_table(path: Path) -> Any:
     try:
         if path.suffix.lower() == ".csv":
             read_text(path, TABLE_LIMIT)  # It must be text of a usual size.
-            return csv.read_csv(str(path))
+            table = csv.read_csv(str(path))
+            return table.rename_columns([name.strip() for name in table.column_names])
         return (
             feather.read_table(str(path)) if path.suffix.lower() == ".feather" else parquet.read_table(path)
         )
     except (OSError, ValueError, pyarrow.ArrowException) as error:
         raise UserError(f"--results {path}: cannot be read as a table: {first_line(error)}") from None
+
+
+def _scan_numbers(drive: Path) -> Mapping[str, int]:
+    """Return the number of each scan of a data set like KITTI's by the name of its files."""
+    return {file.stem: number for number, file in enumerate(files_in(drive / "velodyne", [".bin"]))}
 
 
 def _number(text: str) -> int | None:
