@@ -163,6 +163,8 @@ def _report(evaluation: Evaluation, limits: list[Limit], options: EvaluateOption
 
     if not options.output and options.output.json != STDOUT:
         print(evaluation.table())
+    elif options.output.json == STDOUT:
+        warn(evaluation.warnings)
     results = check(limits, evaluation.metrics)
     write_json(options.output.json, "evaluate", evaluation.result(results))
     if options.limits.junit is not None:

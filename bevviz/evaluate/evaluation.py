@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -12,7 +13,7 @@ import numpy as np
 
 from bevviz.errors import printable
 from bevviz.evaluate.average_precision import OVERLAPS, RECALL_POINTS, VIEWS, AveragePrecision, scored_objects
-from bevviz.evaluate.ground_truth import Truth, TruthLookup
+from bevviz.evaluate.ground_truth import MAX_DISTANCE, Truth, TruthLookup
 from bevviz.evaluate.matching import Matches, ObjectScore, position_text, rates, share
 from bevviz.evaluate.metrics import LimitResult, base_of, ranges
 from bevviz.evaluate.tracking_score import TrackScore
@@ -103,6 +104,9 @@ class Evaluation(Observer[FrameResult], Tabular):
         self._tracks = TrackScore()
         self._detections = ObjectScore(self.score.accepted)
         self._ground: Counter[str] = Counter()
+        self._misnamed: Counter[tuple[str, str]] = (
+            Counter()
+        )  # missed labels by label and name of the object there
         self._metrics: dict[str, float] | None = None
 
     def observe(self, result: FrameResult) -> None:
@@ -116,6 +120,7 @@ class Evaluation(Observer[FrameResult], Tabular):
         objects = result.objects or Objects.empty()
         matches = self.score.add(objects, truth, result.cameras)
         self.last = result, truth, matches
+        self._misnamed.update(_misnamed(objects, truth, matches))
         self.causes = {} if self._causes is None else self._causes(result, truth, matches)
         self.false_causes.update(cause.kind.value for cause in self.causes.values())
         self.judged.append(_outcome(result.frame, objects, truth, matches, self.causes))
@@ -192,6 +197,20 @@ class Evaluation(Observer[FrameResult], Tabular):
         wrong = [frame for frame in self.judged if frame.missed or frame.false]
         return sorted(wrong, key=lambda f: (-len(f.missed) - len(f.false), f.frame))
 
+    @property
+    def warnings(self) -> list[str]:
+        """A sentence for each label of which none was found, but mostly objects of one other name."""
+        sentences = []
+        for (label, name), number in self._misnamed.items():
+            counts = self.score.counts(label.lower())
+            if not counts["true"] and 2 * number > counts["missed"]:
+                instead = (
+                    f"{number} of {counts['missed']} have an object named '{name}' within {MAX_DISTANCE:g} m"
+                )
+                rule = f"--set 'source.labels={json.dumps({label: [name]})}'"
+                sentences.append(f"no '{label}' was found, but {instead}: if that is the same, {rule}")
+        return sentences
+
     # --- how it is shown -----------------------------------------------------------------------
 
     def table(self) -> str:
@@ -245,6 +264,16 @@ def count_ground(counts: Counter[str], result: FrameResult) -> None:
     counts["lost"] += int((is_ground & object_points).sum())
 
 
+def _misnamed(objects: Objects, truth: Truth, matches: Matches) -> Iterator[tuple[str, str]]:
+    """Yield each missed label with the name of the nearest object there that no label accepts."""
+    free = np.flatnonzero(matches.partner < 0)
+    for row in np.flatnonzero(matches.missed).tolist() if len(free) else ():
+        offset = objects.boxes.center[free, :2] - truth.boxes.center[row, :2]
+        distance = np.linalg.norm(offset, axis=1)
+        if distance.min() <= MAX_DISTANCE:
+            yield truth.labels[row], objects.names[free[distance.argmin()]].lower()
+
+
 # --- words -------------------------------------------------------------------------------------
 
 
@@ -287,6 +316,7 @@ def _lines(
     if evaluation.unusable:
         count = "1 label is" if len(evaluation.unusable) == 1 else f"{len(evaluation.unusable)} labels are"
         yield f"{count} left out, the first: {evaluation.unusable[0]}"
+    yield from evaluation.warnings
     for rows in tables(evaluation):
         yield ""
         yield from laid_out(rows)
