@@ -294,18 +294,22 @@ def test_boxes_that_do_not_fit_the_images_are_named(
         ),
     ],
 )
-def test_labels_of_another_convention_are_named(
+def test_boxes_of_another_convention_are_named(
     results: list[FrameResult], change: Callable[[Boxes3D], Boxes3D], text: str
 ) -> None:
+    """Ground truth, and beside it the same boxes in a result file."""
     with bevviz.simulate(1) as drive:
         checks = InputChecks(drive.frames, drive.config)
         for result in results:
             truth = result.frame.truth
             assert truth is not None
-            frame = replace(result.frame, truth=replace(truth, boxes=change(truth.boxes)))
+            truth = replace(truth, boxes=change(truth.boxes))
+            boxes = replace(truth, topic="/results/net")
+            frame = replace(result.frame, truth=truth, robot_boxes=(boxes,))
             checks.observe(replace(result, frame=frame))
-    (said,) = [str(finding) for finding in checks.findings if finding.kind == "truth"]
-    assert text in said
+    said = [str(finding) for finding in checks.findings if finding.kind == "truth"]
+    assert [text in sentence for sentence in said] == [True, True]
+    assert said[0].startswith("ground truth: ") and said[1].startswith("/results/net: ")
 
 
 @pytest.mark.long

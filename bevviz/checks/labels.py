@@ -1,7 +1,8 @@
-"""Checks of the ground truth: boxes without points, and boxes that their points do not fit."""
+"""Checks of ground truth and result files: boxes without points, and boxes that their points do not fit."""
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -9,8 +10,9 @@ from dataclasses import replace
 import numpy as np
 
 from bevviz.checks.read_input import ReadInput
+from bevviz.datasets.result_files import RESULTS
 from bevviz.model.box_points import inside_each
-from bevviz.model.frame import F64, Boxes3D, Frame
+from bevviz.model.frame import F64, Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.input_findings import InputFinding, Remedy
 from bevviz.stages.robot_results import in_points_frame
 
@@ -47,19 +49,26 @@ _ODD = (
 
 
 def wrong_labels(read: ReadInput) -> Iterator[InputFinding]:
-    """Yield ground truth most of whose near boxes do not fit the points, as in another convention."""
-    for of, odd, what, remedy in _ODD:
-        total, count = read.labels[of], read.labels[odd]
+    """Yield topics most of whose near boxes do not fit the points, as in another convention."""
+    for (source, labels), (of, odd, what, remedy) in itertools.product(read.labels.items(), _ODD):
+        total, count = labels[of], labels[odd]
         if total >= ENOUGH and count > SHARE * total:
-            text = f"ground truth: {count} of {total} {what}"
-            yield InputFinding("truth", "ground truth", text, Remedy(remedy))
+            yield InputFinding("truth", source, f"{source}: {count} of {total} {what}", Remedy(remedy))
 
 
-def count_labels(labels: Counter[str], frame: Frame) -> None:
-    """Count the near boxes of the ground truth of a frame, and those that are odd."""
-    if frame.truth is None or not len(frame.points) or labels["near"] >= MOST:
+def count_labels(labels: dict[str, Counter[str]], frame: Frame) -> None:
+    """Count the near boxes of ground truth and of result files in a frame, and those that are odd."""
+    if frame.truth is not None:
+        _count_boxes(labels["ground truth"], frame, frame.truth)
+    for boxes in frame.robot_boxes:
+        if boxes.topic.startswith(RESULTS):
+            _count_boxes(labels[boxes.topic], frame, boxes)
+
+
+def _count_boxes(labels: Counter[str], frame: Frame, labelled: LabelledBoxes3D) -> None:
+    if not len(frame.points) or labels["near"] >= MOST:
         return
-    boxes = in_points_frame(frame.pose, frame.truth)
+    boxes = in_points_frame(frame.pose, labelled)
     boxes = boxes.chosen(boxes.distance < NEAR)
     inside = _count(frame, boxes, FOOT, 1)
     above = _count(frame, boxes, 1, 1.5)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 
 from bevviz.bags.source import BagSource
@@ -52,7 +52,7 @@ class ReadInput:
         images: images that the detector judged.
         answered: those for which it had a candidate, however weak.
         boxes: its kept boxes, and those that are odd, see ``bevviz.checks.detector``.
-        labels: boxes of the ground truth near the LiDAR, and those that are odd.
+        labels: boxes near the LiDAR, and those that are odd, by "ground truth" or the topic of a result file.
     """
 
     source: Items[object]
@@ -62,7 +62,7 @@ class ReadInput:
     images: int = 0
     answered: int = 0
     boxes: Counter[str] = field(default_factory=Counter)
-    labels: Counter[str] = field(default_factory=Counter)
+    labels: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
 
     @property
     def bag(self) -> BagSource | None:
