@@ -86,10 +86,10 @@ def main() -> int:
             command = [sys.executable, "-m", "benchmarks.robot", str(folder), str(options.rate)]
             publisher = stack.enter_context(subprocess.Popen(command, env=os.environ | profile))
             stack.callback(publisher.terminate)
-            raw = RawRecorder(settings.config.live)
+            raw = RawRecorder(settings)
             robot = stack.enter_context(LiveSource(settings.config, tell=notes.info, raw=raw))
             robot.wait()
-            live = Live(robot, settings, outputs, notes, loader=loader, raw=raw, problems=robot.problems)
+            live = Live(robot, settings, outputs, notes, loader=loader)
         else:
             replay = Replay(drive, simulated.scene, rate=options.rate)
             live = Live(replay, settings, outputs, notes, loader=loader)
@@ -97,7 +97,7 @@ def main() -> int:
         live.run(soak.look)
         print(*live.summary, sep="\n")
         if options.dds:
-            print(f"lost by the middleware: {dict(robot.lost) or 'nothing'}")
+            print(f"lost by the middleware: {dict(robot.watch.lost) or 'nothing'}")
     return soak.summary(options.rate)
 
 

@@ -115,9 +115,10 @@ def test_what_is_made_again_is_bounded_and_ends(robot: RunningRobot, drive: Driv
 
 def test_frames_without_messages_are_forgotten(robot: RunningRobot, drive: Drive) -> None:
     """The buffer of messages is the limit: what it has dropped cannot be asked about."""
-    assert robot.live.raw is not None
-    robot.live.raw.config = robot.live.config.live.model_copy(update={"raw_size": 0.000001})
-    robot.live.raw.put(robot.live.raw.messages()[-1])
+    raw = robot.live.source.raw
+    assert raw is not None
+    robot.live.settings.take(["live.raw_size=0.000001"])
+    raw.put(raw.messages()[-1])
     robot.observe(drive.results[-1])
     assert [number for _, number in robot.frame_times()] == [FIRST + FRAMES - 1]
 

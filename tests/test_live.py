@@ -51,7 +51,7 @@ from bevviz.pipeline.session import Session
 from bevviz.recording import blueprints
 from bevviz.support.files import lock_file
 from bevviz.support.queues import NewestQueue
-from tests.support.live_sessions import run_beside
+from tests.support.live_sessions import CalledReceiver, run_beside
 from tests.support.recordings import Recording, verify
 from tests.support.replay import Replay
 from tests.support.waiting import until
@@ -130,14 +130,16 @@ def run(frames: list[Frame], drive: SyntheticSource, tmp_path: Path, monkeypatch
         if source is None and rate is not None:
             source = Replay(frames, drive.scene, rate=rate, total=total)
         source = source or Paced(frames, drive.scene, total)
+        source.problems.tell = (notes := Notes(said.append)).warn
         live = Live(
             source,
             ReloadableConfig(config, settings),
             Outputs(**outputs),
-            Notes(said.append),
+            notes,
             observe=observe,
-            on_result=on_result,
         )
+        if on_result is not None:
+            live.receivers.append(CalledReceiver(on_result))
         paced = source.replay if isinstance(source, Stalled) else source
         if isinstance(paced, Paced):
             paced.through = lambda: live.frames
@@ -319,6 +321,7 @@ class Stalled(Replay):
     def __init__(self, replay: Replay) -> None:
         self.replay, self._over = replay, threading.Event()
         self.scene, self.total, self.warnings = replay.scene, None, ()
+        self.problems, self.raw = replay.problems, replay.raw
         self.states = {"/points": "ok"}
 
     def stop(self) -> None:
@@ -545,9 +548,9 @@ def test_the_flight_recorder_holds_the_last_seconds(
         return SimpleNamespace(poll=lambda: 0)
 
     monkeypatch.setattr("bevviz.live.indexing.rerun_cli.spawn", index)
-    config = load(settings=["live.flight_time=2 s", f"live.flight_folder={tmp_path}"]).live
+    settings = ReloadableConfig(None, ["live.flight_time=2 s", f"live.flight_folder={tmp_path}"])
     with packets_of(results, drive.scene, 80) as (encoder, packets):
-        flight = FlightRecorder(config, encoder, Indexer(), Notes(lambda text: None))
+        flight = FlightRecorder(settings, encoder, Indexer(), Notes(lambda text: None))
         for packet in packets:
             flight.put(packet)
         saved = [flight.save(), flight.save(tmp_path / "second.rrd")]
@@ -574,7 +577,7 @@ def test_a_snapshot_has_its_name_when_it_is_complete(
         raise OSError(28, "No space left on device")
 
     with packets_of(results, drive.scene, 4) as (encoder, packets):
-        flight = FlightRecorder(load().live, encoder, Indexer(), Notes(lambda text: None))
+        flight = FlightRecorder(ReloadableConfig(), encoder, Indexer(), Notes(lambda text: None))
         for packet in packets:
             flight.put(packet)
         monkeypatch.setattr("bevviz.live.flight_recorder.write_all", full)
@@ -586,9 +589,9 @@ def test_a_snapshot_has_its_name_when_it_is_complete(
 
 def test_the_flight_recorder_is_bounded_in_memory(results: list[FrameResult], drive: SyntheticSource) -> None:
     sizes: list[int] = []
-    config = load(settings=["live.flight_time=1000", "live.flight_size=1 MB"]).live
+    settings = ReloadableConfig(None, ["live.flight_time=1000", "live.flight_size=1 MB"])
     with packets_of(results, drive.scene, 80) as (encoder, packets):
-        flight = FlightRecorder(config, encoder, NoIndexer(), Notes(lambda text: None))
+        flight = FlightRecorder(settings, encoder, NoIndexer(), Notes(lambda text: None))
         for packet in packets:
             flight.put(packet)
             sizes.append(flight.size)
@@ -667,8 +670,13 @@ def result_of(frame: Frame, *decisions: Decision, total: float = 0.05) -> FrameR
 def triggers(*settings: str) -> Callable[[FrameResult], str | None]:
     """Return a function that returns what the triggers report for a result."""
     config = load(settings=["live.trigger_pause=0", *settings])
-    watch, detector = Triggers(config.live), AnomalyDetector()
-    return lambda r: watch.check(replace(r, anomalies=detector.update(r, config.anomalies)))
+    watch, detector = Triggers(), AnomalyDetector()
+
+    def check(result: FrameResult) -> str | None:
+        anomalies = detector.update(result, config.anomalies)
+        return watch.check(replace(result, anomalies=anomalies, config=config))
+
+    return check
 
 
 def test_an_unmatched_detection_triggers(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -839,7 +847,7 @@ def test_the_configuration_is_reloaded_when_it_is_saved(run: Run) -> None:
     said: list[str] = []
 
     def during(live: Live) -> None:
-        live.on_change = lambda config: applied.append(config.clustering.eps)
+        live.followers.append(lambda config: applied.append(config.clustering.eps))
         file.write_text("clustering: {eps: 0.75}\n")
         until(lambda: live.config.clustering.eps == 0.75)
         before = live.frames
@@ -863,12 +871,12 @@ def test_the_configuration_is_reloaded_when_it_is_saved(run: Run) -> None:
 
 def test_parameters_can_be_set_during_a_run(run: Run) -> None:
     def during(live: Live) -> None:
-        live.update(["range_x=12", "voxel_size=20 cm", "live.nice=1"])
+        live.settings.take(["range_x=12", "voxel_size=20 cm", "live.nice=1"])
         assert (live.config.bev.range_x, live.config.voxel.size) == (12, 0.2)
         with pytest.raises(UserError, match="range_x"):
-            live.update(["voxel_size=30 cm", "range_x=-1"])
+            live.settings.take(["voxel_size=30 cm", "range_x=-1"])
         assert live.config.voxel.size == 0.2
-        live.update(["source.base_frame=base"])
+        live.settings.take(["source.base_frame=base"])
         frames = live.frames
         until(lambda: live.frames > frames + 2)
         assert os.getpriority(os.PRIO_PROCESS, 0) == 1

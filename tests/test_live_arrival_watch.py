@@ -40,11 +40,9 @@ def test_a_stopped_stream_is_silent_but_a_latched_topic_is_not() -> None:
     watched.now += 3.0
     assert watched.watch.silent_for("/image") == pytest.approx(3.1)
     assert watched.watch.silent_for("/camera_info") == watched.watch.silent_for("/never") == 0
-    assert watched.watch.states({"/image": True, "/camera_info": True, "/tf": False}) == {
-        "/image": "silent",
-        "/camera_info": "ok",
-        "/tf": "no publisher",
-    }
+    assert watched.watch.state("/image", published=True) == "silent"
+    assert watched.watch.state("/camera_info", published=True) == "ok"
+    assert watched.watch.state("/tf", published=False) == "no publisher"
     assert watched.watch.received == {"/image": 20, "/camera_info": 1}
     assert watched.watch.volume["/image"] == 2000
 
@@ -65,13 +63,13 @@ def test_an_unusable_topic_is_reported_once_at_its_start() -> None:
         watch.count("/points", 10)
         watch.mark_unusable("/points", "/points: no field z")
     assert said == ["a message cannot be used: /points: no field z"]
-    assert watch.states({"/points": True}) == {"/points": "unusable"}
+    assert watch.state("/points", published=True) == "unusable"
     assert watch.damage.sentences == [
         "3 message(s) of /points could not be used, the first: /points: no field z"
     ]
     watch.mark_usable("/points")
     assert said[1:] == ["/points: its messages can be used again"]
-    assert watch.states({"/points": True}) == {"/points": "ok"}
+    assert watch.state("/points", published=True) == "ok"
     for _ in range(5):  # one now and then is counted
         watch.mark_unusable("/points", "/points: no field z")
         watch.mark_usable("/points")
@@ -87,7 +85,7 @@ def test_problems_are_told_when_they_begin_change_and_end() -> None:
     problems.set("clock", "/lidar", "", "never told")
     for text in ("0.70 s ahead", "0.71 s ahead", "0.72 s behind"):
         problems.set("clock", "/lidar", text, "right again", "set sync.offsets")
-    assert problems.sentences == ["0.72 s behind: set sync.offsets"]
+    assert [*map(str, problems.current)] == ["0.72 s behind: set sync.offsets"]
     (problem,) = problems.of("/lidar")
     assert problem.finding.kind == "clock" and problem.since == pytest.approx(time.time(), abs=60)
     for count in (900, 1_000):
@@ -99,7 +97,7 @@ def test_problems_are_told_when_they_begin_change_and_end() -> None:
     first, second = "0.70 s ahead: set sync.offsets", "0.72 s behind: set sync.offsets"
     blind = "/lidar2: all 900 points are NaN in 900 frames"
     assert said == [first, second, blind, "seen", "right again", "found out"]
-    assert problems.sentences == []
+    assert problems.current == []
 
 
 def test_a_faulty_sensor_is_a_problem_while_it_lasts() -> None:

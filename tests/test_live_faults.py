@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from bevviz.config import load
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.model.frame import Frame
 from tests.support.faulty_robot import FaultyRobot, faulty_robot
 from tests.support.ros_graphs import own_graph
@@ -50,8 +50,8 @@ def running(*settings: str) -> Iterator[Session]:
     """Run a source, and take its frames in a thread."""
     said: list[str] = []
     patient = "sync.max_wait=20"  # A frame that waits for a silent sensor fails its test.
-    config = load(settings=[patient, *settings])
-    with LiveSource(config, tell=said.append, raw=RawRecorder(config.live)) as source:
+    values = ReloadableConfig(None, [patient, *settings])
+    with LiveSource(values.config, tell=said.append, raw=RawRecorder(values)) as source:
         session = Session(source, said)
 
         def take() -> None:
@@ -105,7 +105,7 @@ def test_a_second_type_on_a_topic_is_named_and_not_used(robot: FaultyRobot) -> N
     with running() as session:
         until(lambda: is_published(session, FUSED, "robot") and "/a" in session.source.topics, "the strings")
         refused: list[str] = []
-        publisher = RosTopics(session.source.node, refused.append)
+        publisher = RosTopics(session.source.nodes.node, refused.append)
         assert len(refused) == 1 and f"/robot publishes {FUSED} as std_msgs/msg/String" in refused[0]
         robot.set("/a", kind="PointCloud2", frame="a")
         clash = "/a has two types: /robot (sensor_msgs/msg/PointCloud2) is received, /stranger (std_msgs"
@@ -128,7 +128,7 @@ def test_no_result_goes_to_a_topic_of_the_robot(robot: FaultyRobot) -> None:
     with running() as session:
         until(lambda: is_published(session, OBSTACLES, "detector"), "the robot's topic")
         told: list[str] = []
-        publisher = RosTopics(session.source.node, told.append)
+        publisher = RosTopics(session.source.nodes.node, told.append)
         assert told == [
             f"{OBSTACLES} is not published: /detector publishes {OBSTACLES}, and messages of two sources "
             f"would mix; --ros-args -r {OBSTACLES}:=/bevviz{OBSTACLES} gives ours another name"
@@ -211,7 +211,7 @@ def test_transforms_come_by_two_subscriptions_and_count_once(robot: FaultyRobot)
     robot.set("/tf", kind="TFMessage", frame="a")
     with running() as session:
         session.until_frames()
-        node, received = session.source._node.input, session.source.received["/tf"]
+        node, received = session.source.nodes.input, session.source.watch.received["/tf"]
         qualities = [
             info.qos_profile.reliability.name for info in node.get_subscriptions_info_by_topic("/tf")
         ]
@@ -220,4 +220,4 @@ def test_transforms_come_by_two_subscriptions_and_count_once(robot: FaultyRobot)
         assert all(frame.world_from_points is not None for frame in session.frames)
         # One message each 0.1 s, as clouds: counted twice they would be twice as many.
         clouds = len(session.frames)
-        assert session.source.received["/tf"] - received < 1.5 * clouds
+        assert session.source.watch.received["/tf"] - received < 1.5 * clouds

@@ -206,7 +206,10 @@ def test_who_publishes_a_type_is_asked_what_it_is_made_of(
                 points.publish(bytes(known.serialize_cdr(stamped(cloud, time.time_ns()), CLOUD)))
                 return True
 
-            until(lambda: publish() and source.wait(0) and source.received["/things"], "a scene with things")
+            until(
+                lambda: publish() and source.wait(0) and source.watch.received["/things"],
+                "a scene with things",
+            )
             frames = iter(source)
             found: list[Any] = []
 

@@ -39,7 +39,6 @@ from tests.support.ros_player import Play
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
 from bevviz.config.reloading import ReloadableConfig
-from bevviz.live.files import define
 from bevviz.live.raw_recorder import LatchedMessages, RawMessage, RawRecorder, children
 from bevviz.live.run_outputs import Outputs
 from bevviz.live.runtime import Live
@@ -48,7 +47,7 @@ from bevviz.live.status import Notes
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import encode_transforms
 from tests.support.fed_graph import FedGraph, Player, fed_graph, play_in_step
-from tests.support.live_sessions import run_beside
+from tests.support.live_sessions import CalledReceiver, run_beside
 
 SECONDS = 1.0  # that the flight recorder holds: with three seconds before them less than the run takes
 POINTS = 3000
@@ -82,7 +81,7 @@ def fly(folder: Path, graph: FedGraph) -> Flight:
     results: dict[int, Any] = {}
     sizes: list[tuple[int, float]] = []
     settings = ReloadableConfig(None, [f"live.flight_time={SECONDS} s"])
-    raw = RawRecorder(settings.config.live)
+    raw = RawRecorder(settings)
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     description = graph.advertise("/robot_description", STRING, qos=latched)
     graph.publish(description, typestore().types[STRING](data="<robot name='r'/>"))
@@ -98,8 +97,9 @@ def fly(folder: Path, graph: FedGraph) -> Flight:
             settings,
             Outputs(save=Path("all.rrd"), raw=Path("all.mcap")),
             Notes(said.append),
-            on_result=lambda result: results.update({result.frame.stamp: digest(result)}),
-            raw=raw,
+        )
+        live.receivers.append(
+            CalledReceiver(lambda result: results.update({result.frame.stamp: digest(result)}))
         )
         live.encoder.clock = lambda: graph.now
 
@@ -108,7 +108,7 @@ def fly(folder: Path, graph: FedGraph) -> Flight:
                 graph.publish(heights, wide)
                 play_in_step(player, live, source)
                 sizes.append((raw.size, raw.seconds))
-            live.save(Path("snap.rrd"))
+            live.flight.save(Path("snap.rrd"))
 
         run_beside(live, feed)
     return Flight(folder, results, said, sizes)
@@ -245,7 +245,7 @@ def test_a_full_disk_leaves_a_bag_that_can_be_read(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr("bevviz.bags.completion.write_all", limited)
     random_bytes = np.random.default_rng(0).bytes
-    with McapWriter(tmp_path / "x.mcap", define) as bag:
+    with McapWriter(tmp_path / "x.mcap", lambda connection: connection.msgdef) as bag:
         with pytest.raises(UserError, match="No space left"):
             for time_ in range(100):
                 bag.write(connection, time_, random_bytes(1_000_000))

@@ -55,7 +55,7 @@ def result(first: Frame, index: int, robot: float | None = None, x: float = 10.0
 
 
 def test_boxes_may_arrive_before_or_after_the_result(first: Frame) -> None:
-    against = RobotComparison("", CONFIG.live)
+    against = RobotComparison("")
     (with_it,) = against.compare(result(first, 0, robot=10.1))
     assert [d.change for d in with_it.objects] == [Change.SAME] and against.topic == TOPIC
     assert against.compare(result(first, 1)) == []
@@ -77,7 +77,7 @@ def detections(frame: Frame, camera: str) -> LabelledBoxes2D:
 
 
 def test_image_boxes_count_if_they_precede_the_3d_boxes(first: Frame) -> None:
-    against = RobotComparison("", CONFIG.live)
+    against = RobotComparison("")
     camera = first.cameras[0].name
     assert against.compare(result(first, 0)) == []
     old = result(first, 0).frame
@@ -93,7 +93,7 @@ def test_image_boxes_count_if_they_precede_the_3d_boxes(first: Frame) -> None:
 
 
 def test_a_difference_that_lasts_is_a_reason_once(first: Frame) -> None:
-    against = RobotComparison("", CONFIG.live)
+    against = RobotComparison("")
     reasons = []
     for index in range(12):
         against.compare(result(first, index, robot=10.0 if index in (0, 7) else 11.0))
@@ -105,7 +105,7 @@ def test_a_difference_that_lasts_is_a_reason_once(first: Frame) -> None:
 
 
 def test_several_topics_are_told_and_nothing_grows(first: Frame) -> None:
-    against = RobotComparison("", CONFIG.live)
+    against = RobotComparison("")
     both = result(first, 0)
     frame = both.frame
     both = replace(both, frame=replace(frame, robot_boxes=(theirs(frame, 1, "/a"), theirs(frame, 1, "/b"))))
@@ -117,7 +117,7 @@ def test_several_topics_are_told_and_nothing_grows(first: Frame) -> None:
 
 def test_a_frame_that_ours_made_nothing_of_is_not_compared(first: Frame) -> None:
     """Nothing was found and nothing was looked for are two things: a failed stage is no difference."""
-    against = RobotComparison("", CONFIG.live)
+    against = RobotComparison("")
     (before,) = against.compare(result(first, 0, robot=11.0))
     assert before.counts[Change.MOVED] == 1
     for index in range(1, 9):

@@ -59,6 +59,7 @@ from bevviz.live.publish import (
 )
 from bevviz.live.publish import TOPICS as TOPICS_PUBLISHED
 from bevviz.live.source import LiveSource
+from bevviz.live.status import Notes
 
 TYPES = drive_of(Play()).types
 PLAY = Play(points=20_000)  # a cloud goes over the wire in several pieces
@@ -94,7 +95,7 @@ def test_frames_are_those_of_the_drive(robot: str) -> None:
         # Of a hundred images one is lost where nobody came for it in time.
         heard = list(islice((frame for frame in frames(source) if frame.cameras[0].image is not None), 6))
         assert source.scene.lidar == "rslidar" and source.scene.cameras == ("zed",) and source.scene.truth
-        assert set(source.received) == set(TYPES)
+        assert set(source.watch.received) == set(TYPES)
     assert [frame.index for frame in heard] == sorted({frame.index for frame in heard})
     for frame in heard:
         true = next(f for f in drive if np.array_equal(np.resize(f.points, (20_000, 3)), frame.points))
@@ -155,7 +156,7 @@ def test_a_late_publisher_may_restart_with_other_qos() -> None:
             live = frames(source)
             first = next(live)
         until(lambda: f"{LIDAR_TOPIC} has no publisher" in "".join(said), "the publisher's end is told")
-        assert any(text.startswith("/tf_static has no publisher") for text in source.problems.sentences)
+        assert any(str(one).startswith("/tf_static has no publisher") for one in source.problems.current)
         with playing(replace(PLAY, best_effort=True, focal=1.25)):
             until(lambda: any("calibration" in text for text in said), "the new calibration is told")
             told = time.time_ns()  # what nobody took before is still handed out
@@ -177,7 +178,7 @@ def test_incompatible_publisher_is_told(robot: str) -> None:
     ):
         frame = next(frames(source))
         told = "/tf_static: /volatile is not heard, its quality of service does not fit (Volatile publisher"
-        until(lambda: any(text.startswith(told) for text in source.problems.sentences), "the mismatch")
+        until(lambda: any(str(one).startswith(told) for one in source.problems.current), "the mismatch")
         assert any(text.startswith(told) for text in said)
         assert frame.cameras[0].camera_from_points is not None
 
@@ -243,8 +244,8 @@ def test_published_results_are_not_read_back(result: FrameResult) -> None:
     kinds |= {DETECTIONS: "Detection2DArray", TRACKS: "Detection3DArray", MARKERS: "MarkerArray"}
     with LiveSource(load()) as source, Node(name="rviz") as rviz:
         rviz.start()
-        topics = RosTopics(source.node)
-        publisher = Publisher(load(), [topics])
+        topics = RosTopics(source.nodes.node)
+        publisher = Publisher([topics], Notes(print))
         publisher.publish(result)  # for nobody
         for topic, short in kinds.items():
             kind = TOPICS_PUBLISHED[topic]

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from bevviz.config import load
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.drivers.video import VideoPacket
 from bevviz.errors import UserError
 from bevviz.extras.demo.drive import CAMERA_INFO_TOPIC, LIDAR_TOPIC, TRUTH_TOPIC
@@ -343,7 +344,7 @@ def test_images_that_wait_are_taken_with_the_first() -> None:
 def test_a_topic_of_an_unknown_type_is_named_as_not_saved(graph: FedGraph) -> None:
     graph.advertise("/arm/state", "arm_msgs/msg/State")
     player = Player(graph)
-    with joined(graph, raw=RawRecorder(load().live)) as session:
+    with joined(graph, raw=RawRecorder(ReloadableConfig())) as session:
         player.play(NEEDED + 2.0)
         told = "/arm/state is not among the saved messages: arm_msgs/msg/State"
         assert session.told(told), session.said

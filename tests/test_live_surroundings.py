@@ -30,7 +30,7 @@ from bevviz.live.source import LiveSource
 from bevviz.live.status import Notes
 from bevviz.live.typesupport import message_type
 from tests.support.fed_graph import FedGraph, Player, fed_graph, play_in_step
-from tests.support.live_sessions import run_beside
+from tests.support.live_sessions import CalledReceiver, run_beside
 
 pytestmark = pytest.mark.long
 
@@ -159,20 +159,21 @@ def fly(folder: Path, graph: FedGraph) -> Flight:
     said: list[str] = []
     asked = ["objects.method=topic:/ours/objects", "live.robot_time=0.5 s", "live.trigger_after=0"]
     settings = ReloadableConfig(None, ["live.flight_time=600 s", *asked])
-    raw = RawRecorder(settings.config.live)
+    raw = RawRecorder(settings)
     player, robot = Player(graph, frames=3), Robot(graph)
     graph.subscribe(message_type(BOXES), TRUTH_TOPIC, robot.objects, QoSProfile(depth=10))
     with LiveSource(settings.config, raw=raw) as source:
         player.play(2.0)
         assert source.wait(0), source.missing
-        diagnostics = Diagnostics(source.node)
+        diagnostics = Diagnostics(source.nodes.node)
 
         def on_result(result: FrameResult) -> None:
             frames.append(result.frame)
             diagnostics.observe(result)
 
-        live = Live(source, settings, Outputs(), Notes(said.append), on_result=on_result, raw=raw, robot="")
-        live.problems.set("robots", "namespaces", "two robots are merged", "", "--ros-args -r __ns:=/a")
+        live = Live(source, settings, Outputs(), Notes(said.append), robot="")
+        live.receivers.append(CalledReceiver(on_result))
+        live.problems.set("robots", "names", "two robots are merged", "", "--ros-args -r __ns:=/a")
         diagnostics.every_second(lambda: diagnostics.publish(live.numbers, live.problems.current))
 
         def feed() -> None:
@@ -182,11 +183,11 @@ def fly(folder: Path, graph: FedGraph) -> Flight:
                     robot.path()
                     play_in_step(player, live, source)
             robot.say("/bevviz/mark", STRING, make(STRING, data=MARK))
-            live.mark(PAGE_MARK)
+            source.mark(PAGE_MARK)
             for _ in range(10):
                 play_in_step(player, live, source)
             until(lambda: any("robot and ours differ" in text for text in said), "a save for that")
-            live.save(Path("snap.rrd"))
+            live.flight.save(Path("snap.rrd"))
 
         run_beside(live, feed)
     heard = [one for message in graph.sent["/diagnostics"] for one in message.status]
@@ -247,7 +248,7 @@ def test_bevviz_publishes_its_own_diagnostics(flight: Flight) -> None:
     assert int(by_name["bevviz: sources"].level) == 1
     texts = {pair.key: pair.value for pair in by_name["bevviz: sources"].values}
     merged = "two robots are merged: --ros-args -r __ns:=/a"
-    assert texts["robots namespaces"].startswith(f"{merged} (for ")
+    assert texts["robots names"].startswith(f"{merged} (for ")
     assert by_name["bevviz: sources"].message.startswith(merged)
     numbers = {pair.key: pair.value for pair in by_name["bevviz: pipeline"].values}
     assert float(numbers["frames"]) > 0 and float(numbers["raw_mb"]) > 0 and "dropped: source" in numbers

@@ -89,7 +89,7 @@ def test_viewers_get_fewer_points_and_files_all(
 def test_what_is_held_to_be_saved_has_all_points(bench: RunningRobot, results: list[FrameResult]) -> None:
     live = bench.live
     packet = live.encoder.encode(results[0], live.scene, {}, ())
-    flight = FlightRecorder(live.config.live, live.encoder, Indexer(), live.notes)
+    flight = FlightRecorder(ReloadableConfig(), live.encoder, Indexer(), live.notes)
     flight.put(packet)
     assert flight.packets()[0].data == packet.data and flight.packets()[0].thinned is None
     assert packet.thinned is not None and len(packet.thinned) < len(packet.data) / 2

@@ -574,7 +574,7 @@ def test_a_ros_parameter_names_no_function(received: Path, monkeypatch: pytest.M
     monkeypatch.setitem(sys.modules, "rcl_interfaces.msg", msg)
     write_project(received, "")
     settings, node = ReloadableConfig(), Node()
-    RosRequests(node, settings.config, settings.take)
+    RosRequests(node, settings)
     told = node.on_set([Parameter("ground.method", "drive_tools:segment")])
     assert not told.successful
     assert "start bevviz with --set ground.method=drive_tools:segment" in told.reason

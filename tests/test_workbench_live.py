@@ -288,7 +288,7 @@ def test_a_page_says_that_no_frame_comes(
     assert bench.progress()["error"] == ""
     bench.news.listen(lambda: news.append(bench.progress()["error"]))
     states = {"/points": "silent", "/camera": "ok"}
-    monkeypatch.setattr(live._source, "states", states, raising=False)
+    monkeypatch.setattr(live.source, "states", states, raising=False)
     monkeypatch.setattr(live, "_logged", time.monotonic() - 2)
     live._log_meanwhile()
     until(lambda: "no frame comes: /points (silent)" in news)

@@ -28,17 +28,13 @@ from bevviz.errors import UserError
 from bevviz.support import progress
 
 if TYPE_CHECKING:
-    from bevviz.config import Config
     from bevviz.config.reloading import ReloadableConfig
     from bevviz.live.companions import Companion
-    from bevviz.live.problems import CurrentProblems
-    from bevviz.live.raw_recorder import RawRecorder
     from bevviz.live.requests import Control
+    from bevviz.live.run_outputs import Outputs
     from bevviz.live.runtime import Live
-    from bevviz.live.source import LiveSource
     from bevviz.live.source_wrappers import RobotFrames
     from bevviz.live.status import Notes
-    from bevviz.model.results import FrameResult
     from bevviz.pipeline.stage_loader import StageLoader
 
 
@@ -120,16 +116,14 @@ def _live(options: LiveOptions) -> int:
     from bevviz.pipeline.stage_loader import StageLoader
 
     chosen, output, config = options.run, options.output, options.config
-    values = collect_settings(options)
+    values, outputs = collect_settings(options), _outputs(output)
     if output.split is not None:
+        if not output.save:
+            raise UserError("--split divides what --save writes: give --save FILE.rrd, too")
         values.append(output.split)
-    _files(output.save)
-    if output.split is not None and not output.save:
-        raise UserError("--split divides what --save writes: give --save FILE.rrd, too")
     if chosen.observe and chosen.robot is not None:
         raise UserError("--robot compares our objects with the robot's: leave --observe out")
     settings = ReloadableConfig(config.file, values, config.preset, config.project_layers)
-    _check_outputs(output)
     loader = StageLoader(store=False)  # no image of a robot comes twice
     if not chosen.observe:
         loader.load(settings.config)
@@ -138,67 +132,37 @@ def _live(options: LiveOptions) -> int:
         watches = extensions(options)
         requested = [watch.open(given, observe=chosen.observe) for watch, given in watches]
         companions = [stack.enter_context(companion) for companion in requested if companion is not None]
-        return _run(settings, options, notes, loader, companions)
+        return _run(settings, options, outputs, notes, loader, companions)
 
 
 def _run(
     settings: ReloadableConfig,
     options: LiveOptions,
+    outputs: Outputs,
     notes: Notes,
     loader: StageLoader,
     companions: Sequence[Companion],
 ) -> int:
-    """Run beside a robot."""
+    """Wait for the robot, then run beside it."""
     from bevviz.live.raw_recorder import RawRecorder
-    from bevviz.live.source import LiveSource
-
-    raw = RawRecorder(settings.config.live)
-    with LiveSource(
-        settings.config, arguments=options.ros_args, tell=notes.info, raw=raw, results=options.run.observe
-    ) as robot:
-        return _watch_robot(robot, settings, options, notes, loader, raw, companions)
-
-
-def _check_outputs(options: LiveOutputs) -> None:
-    """Check the outputs before waiting for a robot."""
-    from bevviz.model.frame import Scene
-    from bevviz.recording import blueprints
-    from bevviz.recording.ports import check_port, own_address
-    from bevviz.recording.sinks import check_viewer
-
-    if options.serve is not None:
-        own_address(options.bind)
-        check_port(options.serve)
-    if options.workbench:
-        check_port(options.workbench, "--workbench")
-    if options.connect is not None:
-        check_viewer(options.connect)
-    blueprints.load(options.blueprint, Scene("live", "lidar", ("lidar",)))
-
-
-def _watch_robot(
-    source: LiveSource,
-    settings: ReloadableConfig,
-    options: LiveOptions,
-    notes: Notes,
-    loader: StageLoader,
-    raw: RawRecorder,
-    companions: Sequence[Companion],
-) -> int:
-    """Wait for the robot, then run."""
     from bevviz.live.requests import Control, answer_sigusr1
+    from bevviz.live.source import LiveSource
     from bevviz.live.source_wrappers import warm_up
+
+    observe = options.run.observe
+    arguments, raw = options.ros_args, RawRecorder(settings)
 
     def refuse(path: Path | None = None) -> Path:
         raise UserError(f"there is nothing to save yet; waiting: {source.missing}")
 
     with (
+        LiveSource(settings.config, arguments=arguments, tell=notes.info, raw=raw, results=observe) as source,
         Control(refuse, notes.warn) as control,
         answer_sigusr1(lambda: notes.warn("there is nothing to save yet")),
     ):
         for companion in companions:
-            companion.join(source.node, settings, refuse)
-        if not options.run.observe:  # Warm up while waiting for the robot.
+            companion.join(source.nodes.node, settings, refuse)
+        if not observe:  # Warm up while waiting for the robot.
             warm_up_stages = partial(warm_up, settings.config, loader)
             threading.Thread(target=warm_up_stages, name="warm up", daemon=True).start()
         reported_missing = ""
@@ -210,73 +174,74 @@ def _watch_robot(
                     say(f"waiting: {reported_missing}")
         if ended.is_set():
             return 1
-        problems = source.problems
-        return _watch(source, settings, options, notes, loader, companions, control, raw, problems)
+        return _watch(source, settings, options, outputs, notes, loader, companions, control)
+
+
+def _outputs(options: LiveOutputs) -> Outputs:
+    """Return the outputs that the options ask for. Check them before waiting for a robot."""
+    from bevviz.live.files import check_name
+    from bevviz.live.run_outputs import Outputs
+    from bevviz.model.frame import Scene
+    from bevviz.recording import blueprints
+    from bevviz.recording.ports import check_port, own_address
+    from bevviz.recording.sinks import check_viewer
+
+    files: dict[str, Path] = {}
+    for path in options.save:
+        check_name(path, ".rrd", ".mcap")
+        if path.suffix in files:
+            raise UserError(f"--save {path}: {files[path.suffix]} is given already; one of each kind")
+        files[path.suffix] = path
+    if options.serve is not None:
+        own_address(options.bind)
+        check_port(options.serve)
+    if options.workbench:
+        check_port(options.workbench, "--workbench")
+    if options.connect is not None:
+        check_viewer(options.connect)
+    blueprints.load(options.blueprint, Scene("live", "lidar", ("lidar",)))
+    shown = (options.serve, options.connect, options.workbench) != (None, None, None)
+    window = options.viewer or (not (files or shown) and has_display())
+    connect = [options.connect] if options.connect else []
+    recording, messages = files.get(".rrd"), files.get(".mcap")
+    return Outputs(recording, window, options.serve, options.bind, connect, options.blueprint, messages)
 
 
 def _watch(
     source: RobotFrames,
     settings: ReloadableConfig,
     options: LiveOptions,
+    outputs: Outputs,
     notes: Notes,
     loader: StageLoader,
     companions: Sequence[Companion],
-    control: Control | None = None,
-    raw: RawRecorder | None = None,
-    problems: CurrentProblems | None = None,
+    control: Control,
 ) -> int:
     """Run until the source ends or the user ends it."""
-    from bevviz.live.publish import Publisher
-    from bevviz.live.run_outputs import Outputs
     from bevviz.live.runtime import Live
 
-    takers = [companion for companion in companions if companion.takes_results]
-    publisher = Publisher(settings.config, takers)
-
-    def publish(result: FrameResult) -> None:
-        publisher.publish(result)
-        for companion in takers:
-            companion.observe(result)
-
-    def show_change(config: Config) -> None:
-        publisher.configure(config)
-        for companion in companions:
-            companion.show(config)
-
-    output = options.output
-    show_window = output.viewer
-    save, messages = _files(output.save)
-    viewer_options = output.serve, output.connect, output.workbench
-    no_output = not output.save and all(option is None for option in viewer_options) and not show_window
-    show_window = show_window or (no_output and has_display())
-    connect = [output.connect] if output.connect else []
-    outputs = Outputs(save, show_window, output.serve, output.bind, connect, output.blueprint, messages)
+    workbench = options.output.workbench
     live = Live(
         source,
         settings,
         outputs,
         notes,
         observe=options.run.observe,
-        on_result=publish if takers else None,
         loader=loader,
-        control=control,
-        raw=raw,
         robot=options.run.robot,
-        problems=problems,
     )
-    if control is not None:
-        control.save = live.save
-    live.on_change = show_change
+    control.save = live.flight.save
     for companion in companions:
         companion.begin(live)
     for url in live.outputs.urls:
         say(f"viewer at {url}", always=True)
-    if no_output and not show_window:
+    ports = outputs.serve, workbench
+    if not (outputs.save or outputs.raw or outputs.window or outputs.connect) and ports == (None, None):
         say("no display: 'bevviz snap' saves the last seconds, --serve shows them in a browser")
     with (
         suppress(KeyboardInterrupt),
         interruptible(twice=True),
-        _page(output.workbench, live),
+        _page(workbench, live),
         progress.bar(unit="frame", desc=source.scene.name) as bar,
     ):
 
@@ -323,21 +288,6 @@ def _page(workbench: int | None, live: Live) -> AbstractContextManager[object]:
         say(f"workbench at {address}", always=True)
 
     return page_server(lambda: session, "live", workbench or None, ready)
-
-
-def _files(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
-    """Return the paths of ``--save``: the recording's and the messages'."""
-    from bevviz.live.files import check_name
-
-    paths_by_suffix: dict[str, Path] = {}
-    for path in paths:
-        check_name(path, ".rrd", ".mcap")
-        if path.suffix in paths_by_suffix:
-            raise UserError(
-                f"--save {path}: {paths_by_suffix[path.suffix]} is given already; one of each kind"
-            )
-        paths_by_suffix[path.suffix] = path
-    return paths_by_suffix.get(".rrd"), paths_by_suffix.get(".mcap")
 
 
 @command(

@@ -35,11 +35,9 @@ class RobotComparison:
 
     Args:
         asked: the robot's Detection3DArray topic. Empty: the topic is recognised by its name.
-        config: limits from which both differ.
     """
 
-    def __init__(self, asked: str, config: LiveConfig) -> None:
-        self.config = config
+    def __init__(self, asked: str) -> None:
         self.topic = ""  # empty until the robot has published boxes
         self.frames = self.differing = 0
         self.without_ours = 0  # frames left out because there are no objects of ours
@@ -90,7 +88,8 @@ class RobotComparison:
             elif boxes.topic == self.topic:
                 self._boxes[stamp] = boxes
         stamps = sorted(self._boxes.keys() & self._waiting.keys())
-        compared = [self._compare(self._waiting.pop(stamp), self._boxes.pop(stamp)) for stamp in stamps]
+        pairs = [(self._waiting.pop(stamp), self._boxes.pop(stamp)) for stamp in stamps]
+        compared = [self._compare(*pair, result.config.live) for pair in pairs]
         waiting: dict[int, Any]
         for waiting in (self._waiting, self._boxes, self._images):
             while len(waiting) > WAITING:
@@ -122,32 +121,33 @@ class RobotComparison:
         except UserError as error:
             self.topic, self.problem = "", str(error)
 
-    def _compare(self, ours: SideResult, boxes: LabelledBoxes3D) -> FrameDifferences:
+    def _compare(self, ours: SideResult, boxes: LabelledBoxes3D, limits: LiveConfig) -> FrameDifferences:
         """Compare one frame. Set the reason to save if the difference has lasted."""
         self._compared.append(ours.stamp)
         objects, images = robot_objects(ours.pose, boxes), self._images.pop(ours.stamp, {})
         frame_differences = differences(ours, replace(ours, objects=objects, images=images, clusters=None))
-        different = [d for d in frame_differences.objects if self._differs(d)]
+        different = [d for d in frame_differences.objects if _differs(d, limits)]
         self.frames += 1
         self.differing += bool(different)
         if not different:
             self._since, self._fired = None, False
         elif self._since is None or ours.stamp < self._since:
             self._since = ours.stamp
-        if self._since is not None and self.config.robot_time is not None and not self._fired:
+        if self._since is not None and limits.robot_time is not None and not self._fired:
             lasted = (ours.stamp - self._since) / SECOND
-            if lasted >= self.config.robot_time:
+            if lasted >= limits.robot_time:
                 self._fired = True
                 words = ", ".join(f"{_words(d)} {frame_differences.position_of(d)}" for d in different[:3])
                 more = f" and {len(different) - 3} more" if different[3:] else ""
                 self._reason = f"robot and ours differ for {lasted:.1f} s: {words}{more}"
         return frame_differences
 
-    def _differs(self, difference: Difference) -> bool:
-        """Return whether a difference is large enough to count."""
-        if difference.change is Change.MOVED:
-            return difference.distance > self.config.robot_tolerance
-        return difference.change is not Change.SAME
+
+def _differs(difference: Difference, limits: LiveConfig) -> bool:
+    """Return whether a difference is large enough to count."""
+    if difference.change is Change.MOVED:
+        return difference.distance > limits.robot_tolerance
+    return difference.change is not Change.SAME
 
 
 def _words(difference: Difference) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from bevviz.config import Config, Layer, Preset, load, untrusted_layers
@@ -27,6 +28,10 @@ class ReloadableConfig:
     run may go on after an edit of the file. Later settings are messages of other programs, and new functions
     in them do not run.
 
+    Attributes:
+        config: configuration in force.
+        apply: called with each new configuration before it is in force. A UserError of it prevents that.
+
     Raises:
         UserError: as ``bevviz.config.load``.
     """
@@ -43,7 +48,9 @@ class ReloadableConfig:
         self._preset = preset
         self._layers = layers
         self._version = self._stat()
+        self._changing = threading.Lock()
         self.config = load(file, settings, preset, layers=layers)
+        self.apply: Callable[[Config], None] = lambda config: None
 
     def changed(self) -> bool:
         """Return whether the file was saved since the last call."""
@@ -54,7 +61,7 @@ class ReloadableConfig:
         return version is not None
 
     def read(self, more: Sequence[str] = (), without: Sequence[str] = ()) -> Config:
-        """Build the current configuration. ``keep`` makes it permanent.
+        """Return the configuration of the file as it is now. ``take`` puts it in force.
 
         Args:
             more: additional settings.
@@ -66,18 +73,17 @@ class ReloadableConfig:
         settings = self._settings_with(more, without)
         return load(self.file, settings, self._preset, layers=self._layers, in_force=self.config)
 
-    def take(self, more: Sequence[str]) -> None:
-        """Add settings before anything runs with them.
+    def take(self, more: Sequence[str] = (), without: Sequence[str] = ()) -> None:
+        """Put the configuration from ``read`` in force. Any thread may call it.
 
         Raises:
-            UserError: a setting is wrong. Nothing is changed.
+            UserError: a setting is wrong, or cannot be applied. Nothing is changed.
         """
-        self.keep(self.read(more), more)
-
-    def keep(self, config: Config, more: Sequence[str] = (), without: Sequence[str] = ()) -> None:
-        """Put a configuration from ``read`` in force, with the same additional and withdrawn settings."""
-        self.config = config
-        self._settings = self._settings_with(more, without)
+        with self._changing:
+            config = self.read(more, without)
+            self.apply(config)
+            self.config = config
+            self._settings = self._settings_with(more, without)
 
     def _settings_with(self, more: Sequence[str], without: Sequence[str]) -> list[str | Layer]:
         """Return the settings with some added and some taken back."""

@@ -9,16 +9,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 from bevviz.support.contexts import Closable
 
 if TYPE_CHECKING:
-    from bevviz.config import Config
     from bevviz.config.reloading import ReloadableConfig
     from bevviz.live.runtime import Live
-    from bevviz.model.results import FrameResult
 
 
 class Companion(Closable):
     """Base class of companions. Each method may stay as it is. ``close`` is called at the end of the run."""
-
-    takes_results = True  # whether ``observe``, ``wants`` and ``send`` are called
 
     def close(self) -> None:
         """Release the resources."""
@@ -36,20 +32,7 @@ class Companion(Closable):
         """
 
     def begin(self, live: Live) -> None:
-        """Follow a run that begins."""
-
-    def show(self, config: Config) -> None:
-        """Take the configuration in force after a change."""
-
-    def observe(self, result: FrameResult) -> None:
-        """Take a result, in a thread of its own. Only the newest comes."""
-
-    def wants(self, topic: str) -> bool:
-        """Return whether anybody receives a topic of ``bevviz.live.publish``."""
-        return False
-
-    def send(self, topic: str, data: bytes, stamp: int) -> None:
-        """Send a message in CDR with its stamp in nanoseconds."""
+        """Follow a run that begins: add to its ``receivers`` and ``followers``."""
 
 
 class Watch(Protocol):

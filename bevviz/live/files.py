@@ -5,13 +5,11 @@ from __future__ import annotations
 import os
 import re
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from queue import SimpleQueue
-
-from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
 
 from bevviz.bags.completion import CHUNK_SIZE, complete
 from bevviz.bags.mcap_writer import McapWriter
@@ -20,9 +18,8 @@ from bevviz.errors import UserError
 from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.indexing import Indexer, remove_leftovers
 from bevviz.live.outputs import Output
-from bevviz.live.raw_recorder import MEGABYTE, RawMessage, RawRecorder
+from bevviz.live.raw_recorder import LEAD, MEGABYTE, RawMessage, RawRecorder
 from bevviz.live.status import Notes
-from bevviz.messages.definitions import definition
 from bevviz.support.contexts import Closable
 from bevviz.support.files import create_file, is_locked, rename_new, write_all
 
@@ -51,9 +48,10 @@ def free_names(save: Path | None, raw: Path | None, notes: Notes) -> tuple[Path 
         UserError: a name cannot be used.
     """
     asked = [path for path in (save, raw) if path is not None]
-    for path in asked:
-        check_name(path, ".rrd", ".mcap")
+    if save is not None:
+        check_name(save, ".rrd")
     if raw is not None:
+        check_name(raw, ".mcap")
         complete_leftovers(raw, notes)
     free = unused_names(*asked)
     if free != asked:
@@ -77,12 +75,17 @@ def _runs(path: Path) -> int:
     """Return the number of the last run with files of this name, or 0 if the name is free."""
     if path.exists() and not path.is_file():
         return 0  # a device
+    runs = [match["run"] for match in _written(path)]
+    return max(int(run or 1) for run in runs) if None in runs else 0
+
+
+def _written(path: Path) -> Iterator[re.Match[str]]:
+    """Yield a match of the name of each file that runs with this path have written, also unfinished ones."""
     name = re.compile(
         re.escape(path.stem)
-        + r"(?:-(?P<run>[1-9]\d{0,5}))?(?:_\d{3,})?(?:\.partial-[0-9a-f]{8})?\.(?:rrd|mcap)"
+        + r"(?:-(?P<run>[1-9]\d{0,5}))?(?:_\d{3,})?(?P<partial>\.partial-[0-9a-f]{8})?\.(?:rrd|mcap)"
     )
-    runs = [match["run"] for file in path.parent.iterdir() if (match := name.fullmatch(file.name))]
-    return max(int(run or 1) for run in runs) if None in runs else 0
+    yield from filter(None, (name.fullmatch(file.name) for file in sorted(path.parent.iterdir())))
 
 
 # --- recordings --------------------------------------------------------------------------------
@@ -91,18 +94,17 @@ def _runs(path: Path) -> int:
 class RecordingSaver(Output):
     """Output that writes every packet to ``path``. With a limit of size or time, ``path`` is numbered.
 
-    No existing file is overwritten. ``unused_names`` gives free names. A full disk is reported once and ends
+    No existing file is overwritten. ``free_names`` gives free names. A full disk is reported once and ends
     the saving only. The file is then truncated to whole frames.
 
     Raises:
-        UserError: the name does not end in .rrd, or the file cannot be written.
+        UserError: the file cannot be written.
     """
 
     def __init__(
         self, path: Path, config: LiveConfig, encoder: Encoder, indexer: Indexer, notes: Notes
     ) -> None:
         super().__init__("file", config.output_queue)
-        check_name(path, ".rrd")
         remove_leftovers(path.parent)
         self.paths: list[Path] = []
         self.on_part: Callable[[], None] = lambda: None  # called when a further part begins
@@ -248,7 +250,7 @@ class BagSaver(Closable):
     def next_part(self) -> None:
         """Begin a new part. Any thread may call it."""
         if not self._ended:
-            self._raw.begin_again(self._queue.put)
+            self._raw.attach(self._put, self._queue.put, LEAD)
 
     def _put(self, message: RawMessage) -> None:
         """Queue a message, or drop it if too many bytes wait."""
@@ -262,7 +264,7 @@ class BagSaver(Closable):
         number = f"_{len(self.paths):03d}" if self._numbered else ""
         # No compression, as with `ros2 bag record`. It would take CPU time from the robot.
         path = self._path.with_stem(f"{self._path.stem}{number}")
-        part = McapWriter(path, define, compress=False, replace=False)
+        part = McapWriter(path, attrgetter("msgdef"), compress=False, replace=False)
         part.__enter__()
         self.paths.append(path)
         return part
@@ -320,21 +322,9 @@ def write_bag(path: Path, messages: Sequence[RawMessage], *, compress: bool = Tr
     """
     if path.exists():
         raise UserError(f"{path}: is already there")
-    with McapWriter(path, define, compress=compress, replace=False) as bag:
+    with McapWriter(path, attrgetter("msgdef"), compress=compress, replace=False) as bag:
         for message in messages:
             bag.write(message.connection, message.received, message.data, message.sent)
-
-
-def define(connection: Connection) -> MessageDefinition:
-    """Return the definition of a connection's message type."""
-    return _defined(connection.msgtype)
-
-
-@cache
-def _defined(kind: str) -> MessageDefinition:
-    text = definition(kind)
-    form = MessageDefinitionFormat.NONE if text is None else MessageDefinitionFormat.MSG
-    return MessageDefinition(form, text or "")
 
 
 def complete_leftovers(path: Path, notes: Notes) -> None:
@@ -342,9 +332,8 @@ def complete_leftovers(path: Path, notes: Notes) -> None:
 
     Each gets its final name. If that is taken, it gets its unfinished name without ".partial".
     """
-    name = re.compile(re.escape(path.stem) + r"(?:-[1-9]\d{0,5})?(?:_\d{3,})?\.partial-[0-9a-f]{8}\.mcap")
-    for left in sorted(path.parent.iterdir()):
-        if not name.fullmatch(left.name) or left.is_symlink() or is_locked(left):
+    for left in [path.with_name(match[0]) for match in _written(path) if match["partial"]]:
+        if left.suffix != ".mcap" or left.is_symlink() or is_locked(left):
             continue
         try:
             count = complete(left)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from bevviz.anomalies import Onsets
 from bevviz.config import LiveConfig
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.files import write_bag
@@ -32,7 +33,7 @@ class FlightRecorder(Closable):
     does not delay the run. Any thread may call it.
 
     Args:
-        config: limits of the buffer.
+        settings: limits of the buffer.
         encoder: makes the beginning of a recording.
         indexer: gives saved recordings an index.
         notes: takes a report of each snapshot.
@@ -41,13 +42,13 @@ class FlightRecorder(Closable):
 
     def __init__(
         self,
-        config: LiveConfig,
+        settings: ReloadableConfig,
         encoder: Encoder,
         indexer: Indexer,
         notes: Notes,
         raw: RawRecorder | None = None,
     ) -> None:
-        self.config = config
+        self._settings = settings
         self._encoder, self._indexer, self._notes, self._raw = encoder, indexer, notes, raw
         self._packets: deque[Packet] = deque()
         self._size = 0
@@ -62,6 +63,10 @@ class FlightRecorder(Closable):
         for thread in self._delayed:
             thread.join()
         self._worker.shutdown()
+
+    @property
+    def _limits(self) -> LiveConfig:
+        return self._settings.config.live
 
     @property
     def size(self) -> int:
@@ -81,15 +86,15 @@ class FlightRecorder(Closable):
     def put(self, packet: Packet) -> None:
         """Add a packet and drop old ones."""
         with self._lock:
-            if self.config.flight_time == 0 or not (self._packets or packet.whole):
+            if self._limits.flight_time == 0 or not (self._packets or packet.whole):
                 return
             self._packets.append(replace(packet, thinned=None))
             self._size += len(packet.data)
-            self._forget(packet.time - self.config.flight_time)
+            self._forget(packet.time - self._limits.flight_time)
 
     def _forget(self, before: float) -> None:
         """Drop packets that are too old or too many. The first one left is a whole packet."""
-        limit = self.config.flight_size * MEGABYTE
+        limit = self._limits.flight_size * MEGABYTE
         while self._packets and (
             self._packets[0].time < before or self._size > limit or not self._packets[0].whole
         ):
@@ -114,8 +119,7 @@ class FlightRecorder(Closable):
             UserError: there is no frame yet, or the .rrd file cannot be written. A failure of the .mcap
                 file is only reported.
         """
-        raw = self._raw
-        messages = raw.messages() if raw is not None and raw.config.raw_size > 0 else []
+        messages = self._raw.messages() if self._raw is not None and self._limits.raw_size > 0 else []
         return self._worker.submit(self._write, path, reason, self.packets(), messages).result()
 
     def save_soon(self, reason: str, after: float = 0.0) -> None:
@@ -142,9 +146,9 @@ class FlightRecorder(Closable):
     ) -> Path:
         """Write both files and report it."""
         if not packets:
-            off = "; it is off (live.flight_time is 0)" if self.config.flight_time == 0 else " yet"
+            off = "; it is off (live.flight_time is 0)" if self._limits.flight_time == 0 else " yet"
             raise UserError(f"the flight recorder holds no frame{off}")
-        saved = _unused(Path(self.config.flight_folder)) if path is None else path
+        saved = _unused(Path(self._limits.flight_folder)) if path is None else path
         self._write_recording(saved, packets)
         about, why = str(saved), f" ({reason})" if reason else ""
         if messages:
@@ -196,18 +200,17 @@ class Triggers:
     ``check`` returns a reason to save at most once in ``live.trigger_pause``.
     """
 
-    def __init__(self, config: LiveConfig) -> None:
-        self.config = config
+    def __init__(self) -> None:
         self._onsets = Onsets()
         self._fired = -math.inf
 
     def check(self, result: FrameResult) -> str | None:
         """Return the reason to save, or None."""
         # Called for every result, so that old anomalies do not count as new.
-        onsets = self._onsets.of(result.anomalies)
-        reasons = [anomaly.text for anomaly in onsets if anomaly.kind in self.config.triggers]
+        onsets, config = self._onsets.of(result.anomalies), result.config.live
+        reasons = [anomaly.text for anomaly in onsets if anomaly.kind in config.triggers]
         now = time.monotonic()
-        if not reasons or now - self._fired < self.config.trigger_pause:
+        if not reasons or now - self._fired < config.trigger_pause:
             return None
         self._fired = now
         return "; ".join(reasons)

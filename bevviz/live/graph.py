@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
@@ -283,16 +284,13 @@ def _hurried_qos(qos: Any) -> Any:
 
     Beside large clouds reliable transforms come half a second late. Best effort brings a part of them soon.
     """
-    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+    from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
     if qos.reliability != ReliabilityPolicy.RELIABLE or qos.durability != DurabilityPolicy.VOLATILE:
         return None
-    return QoSProfile(
-        history=qos.history,
-        depth=qos.depth,
-        reliability=ReliabilityPolicy.BEST_EFFORT,
-        durability=qos.durability,
-    )
+    hurried = copy(qos)
+    hurried.reliability = ReliabilityPolicy.BEST_EFFORT
+    return hurried
 
 
 def _first_of_two(

@@ -56,18 +56,19 @@ def describe(
     with LiveSource(config, arguments=arguments, name="bevviz_info") as source:
         with suppress(KeyboardInterrupt):
             _wait(source, patience)
-        before, volume = source.received, source.volume
+        watch = source.watch
+        before, volume = watch.received.copy(), watch.volume.copy()
         start = time.monotonic()
         frame = _last_frame(source, seconds)
         seconds = time.monotonic() - start
-        counts, volume = source.received - before, source.volume - volume
+        counts, volume = watch.received - before, watch.volume - volume
         absent = source.missing
         missing = [absent] if absent else find_missing(source.roles, frame, config)
         networks, lacking = network_providers(config)
         missing += lacking
         return LiveInfo(
-            domain=source.domain,
-            middleware=source.middleware,
+            domain=source.nodes.domain,
+            middleware=source.nodes.middleware,
             seconds=seconds,
             topics=tuple(
                 _topic(topic, source, counts[topic.name], volume[topic.name], seconds)
@@ -75,7 +76,7 @@ def describe(
             ),
             lidars=source.roles.lidar_names,
             cameras=[*map(CameraInfo.of, frame.cameras)] if frame else (),
-            transforms=source.tree,
+            transforms=dict(source.inputs.sync.tf.tree()),
             points_frame=frame.points_frame if frame else "",
             world_frame=frame.world_frame if frame and frame.world_from_points is not None else "",
             network=networks["detector"],
@@ -110,17 +111,17 @@ def _last_frame(source: LiveSource, seconds: float) -> Frame | None:
 
 
 def _topic(topic: PublishedTopic, source: LiveSource, count: int, volume: int, seconds: float) -> TopicInfo:
-    heard = topic.name in source.received
+    heard = topic.name in source.watch.received
     stream = heard and topic.name not in source.roles.tf_static
     role = source.roles.notes.get(topic.name, "")
     return TopicInfo(
         name=topic.name,
         type=topic.type,
         count=count if heard else None,
-        frame_id=source.frame_ids.get(topic.name, ""),
+        frame_id=source.inputs.frame_ids.get(topic.name, ""),
         rate=count / seconds if stream else None,
         size=volume / count if count else None,
-        delay=source.delay(topic.name) if stream else None,
+        delay=source.inputs.sync.clocks.lag(topic.name) if stream else None,
         role=f"{role}; {describe_qos(topic)}" if role else "",
     )
 

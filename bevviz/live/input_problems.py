@@ -78,28 +78,20 @@ class InputProblems:
             over = f"LiDAR {cloud.topic} sees points again"
             self._problems.set("blind", cloud.topic, text, over, begins=BLIND)
 
-    def look(
-        self,
-        topics: Mapping[str, PublishedTopic],
-        lost: Mapping[str, int],
-        *,
-        complete: bool,
-        no_clouds: bool,
-    ) -> None:
+    def look(self, topics: Mapping[str, PublishedTopic], *, complete: bool) -> None:
         """Check everything.
 
         Args:
             topics: published topics.
-            lost: messages that the middleware has lost, by topic.
             complete: whether the scene is known.
-            no_clouds: whether no LiDAR delivers.
         """
         roles = self._inputs.roles
+        no_clouds = complete and self._watch.without(roles.lidars) > SILENCE
         shown = {name for name, _, _ in roles.around}
         for name in self._subscriptions.topics:
             if name in topics or name not in shown:  # topics shown around the robot come and go
-                self._check_topic(name, topics.get(name), no_clouds)
-                self._check_losses(name, lost.get(name, 0))
+                self._check_topic(topics.get(name, PublishedTopic(name, "", ())), no_clouds)
+                self._check_losses(name)
         self._check_graph(topics, complete, no_clouds)
         self._check_clocks()
         frames = self._inputs.sync.report.frames
@@ -110,21 +102,21 @@ class InputProblems:
 
     # --- topics --------------------------------------------------------------------------------
 
-    def _check_topic(self, name: str, topic: PublishedTopic | None, no_clouds: bool) -> None:
+    def _check_topic(self, topic: PublishedTopic, no_clouds: bool) -> None:
         """Check the publishers of a topic that has a role, and whether it is silent."""
-        roles, note = self._inputs.roles, self._problems.set
+        roles, note, name = self._inputs.roles, self._problems.set, topic.name
         gone = f"{name} has no publisher any more; waiting for it to come back"
-        note("no publisher", name, gone if topic is None else "", f"{name} is published again")
-        note("types", name, topic.clash if topic is not None else "", f"{name} has one type")
-        unheard = "; ".join(self._subscriptions.mismatches(topic)) if topic is not None else ""
+        note("no publisher", name, "" if topic.publishers else gone, f"{name} is published again")
+        note("types", name, topic.clash, f"{name} has one type")
+        unheard = "; ".join(self._subscriptions.mismatches(topic))
         note("quality", name, unheard, f"{name}: every publisher is received")
-        silent = topic is not None and self._watch.silent_for(name) > 0
+        silent = bool(topic.publishers) and self._watch.silent_for(name) > 0
         silent = silent and not (name in roles.lidars and no_clouds)
         quiet = f"no message on {name} for {SILENCE:g} s, though it has a publisher"
         note("silent", name, quiet if silent else "", f"{name} is back")
         sensors = {*roles.lidars, *(camera.topic for camera in roles.cameras)}
-        several = topic is not None and name in sensors and len(topic.publishers) > 1
-        names = ", ".join(map(full_name, topic.publishers)) if topic is not None else ""
+        several = name in sensors and len(topic.publishers) > 1
+        names = ", ".join(map(full_name, topic.publishers))
         mixed = f"{name} has several publishers, taken for one sensor: {names}; remap all but one"
         note("publishers", name, mixed if several else "", f"{name} has one publisher")
         video = self._inputs.sync.videos.get(name)
@@ -132,12 +124,14 @@ class InputProblems:
         awaited = video is not None and video.awaits_key
         note("key frame", name, keyless if awaited else "", f"{name}: a key frame has come")
 
-    def _check_losses(self, name: str, count: int) -> None:
+    def _check_losses(self, name: str) -> None:
         size = self._watch.volume[name] / max(1, self._watch.received[name])
         sizes = (self._watch.volume[other] / n for other, n in self._watch.received.items())
         text = f"messages of {name} are lost on the way: {remedy(size, max(sizes, default=0.0))}"
         over = f"no message of {name} is lost any more"
-        self._follow("lost", {name: count}, lambda _: text, lambda _: over, within=RECENT_LOSS)
+        self._follow(
+            "lost", {name: self._watch.lost[name]}, lambda _: text, lambda _: over, within=RECENT_LOSS
+        )
 
     def _check_graph(self, topics: Mapping[str, PublishedTopic], complete: bool, no_clouds: bool) -> None:
         """Check names, the driver of the frames, and what the configuration states."""

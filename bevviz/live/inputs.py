@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import pairwise
 from statistics import median
@@ -48,62 +48,44 @@ KINDS = {
 }
 
 
-@dataclass(slots=True)
-class _Arrivals:
-    """Arrivals of one topic."""
-
-    count: int = 0
-    bytes: int = 0
-    times: deque[float] = field(default_factory=lambda: deque(maxlen=20))  # seconds, monotonic
-    row: int = 0  # unusable messages since the last usable one
-
-
 class TopicWatch:
-    """Counter of received and unusable messages.
+    """Counter of received, lost and unusable messages.
 
     Args:
         problems: takes the topics whose messages are unusable.
         clock: returns seconds, for tests.
+
+    Attributes:
+        received: messages since the start, by topic.
+        volume: bytes since the start, by topic.
+        lost: messages that the middleware has lost, by topic.
     """
 
     def __init__(self, problems: CurrentProblems, clock: Callable[[], float] = time.monotonic) -> None:
-        self._problems, self._clock = problems, clock
-        self._topics: dict[str, _Arrivals] = defaultdict(_Arrivals)
+        self._problems, self._clock, self._begun = problems, clock, clock()
+        self.received, self.volume, self.lost = Counter[str](), Counter[str](), Counter[str]()
         self.damage = UnusableMessages()
-
-    # --- messages ------------------------------------------------------------------------------
-
-    @property
-    def received(self) -> Counter[str]:
-        """Messages since the start, by topic."""
-        return Counter({name: topic.count for name, topic in self._topics.items()})
-
-    @property
-    def volume(self) -> Counter[str]:
-        """Bytes since the start, by topic."""
-        return Counter({name: topic.bytes for name, topic in self._topics.items()})
+        self._times: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=20))  # seconds, monotonic
+        self._row = Counter[str]()  # unusable messages since the last usable one
 
     def count(self, topic: str, size: int) -> bool:
         """Count a message. Return whether it is the first of its topic."""
-        arrivals = self._topics[topic]
-        arrivals.count += 1
-        arrivals.bytes += size
-        arrivals.times.append(self._clock())
-        return arrivals.count == 1
+        self.received[topic] += 1
+        self.volume[topic] += size
+        self._times[topic].append(self._clock())
+        return self.received[topic] == 1
 
     def mark_usable(self, topic: str) -> None:
         """Record that a message of a topic could be used."""
-        arrivals = self._topics[topic]
-        if arrivals.row:
-            arrivals.row = 0
+        if self._row[topic]:
+            self._row[topic] = 0
             self._problems.set("unusable", topic, "", f"{topic}: its messages can be used again")
 
     def mark_unusable(self, topic: str, reason: str) -> None:
         """Record a message that cannot be used. The reason names the topic."""
-        arrivals = self._topics[topic]
-        arrivals.row += 1
+        self._row[topic] += 1
         count = self.damage.add(topic, reason)
-        if count == 1 or arrivals.row == AGAIN:
+        if count == 1 or self._row[topic] == AGAIN:
             self._problems.set("unusable", topic, f"a message cannot be used: {reason}")
         self._problems.count("unusable", topic, count)
 
@@ -112,10 +94,9 @@ class TopicWatch:
 
         ``least``: shortest time in seconds that is not usual.
         """
-        if topic not in self._topics or len(self._topics[topic].times) < STREAM:
+        if self.received[topic] < STREAM:
             return 0.0
-        times = self._topics[topic].times
-        silent = self._clock() - times[-1]
+        silent = self._clock() - self._times[topic][-1]
         if silent <= least:  # Most are: this is asked many times in a second.
             return 0.0
         return silent if silent > 5 * self.step(topic) else 0.0
@@ -125,21 +106,22 @@ class TopicWatch:
 
         ``newest``: number of the newest steps that count. 0: all that are known.
         """
-        times = self._topics[topic].times if topic in self._topics else ()
-        if len(times) < STREAM:
+        if self.received[topic] < STREAM:
             return 0.0
-        return median([after - before for before, after in pairwise(times)][-newest:])
+        return median([after - before for before, after in pairwise(self._times[topic])][-newest:])
 
-    def states(self, published: Mapping[str, bool]) -> dict[str, TopicState]:
-        """Return the state of each topic, given whether it has a publisher."""
-        return {name: self._state(name, is_published) for name, is_published in published.items()}
+    def without(self, topics: Iterable[str]) -> float:
+        """Return the seconds since the last message of any of these topics, or since the start."""
+        last = max((self._times[name][-1] for name in topics if self.received[name]), default=self._begun)
+        return self._clock() - last
 
-    def _state(self, topic: str, published: bool) -> TopicState:
+    def state(self, topic: str, *, published: bool) -> TopicState:
+        """Return the state of a topic, given whether it has a publisher."""
         if not published:
             return "no publisher"
         if self.silent_for(topic):
             return "silent"
-        return "unusable" if topic in self._topics and self._topics[topic].row else "ok"
+        return "unusable" if self._row[topic] else "ok"
 
 
 class Inputs:
@@ -183,18 +165,7 @@ class Inputs:
     @cached_property
     def _source(self) -> SourceConfig:
         """The configuration with the topic names on the graph."""
-        config, resolve = self._config.source, self._resolve
-        infos, boxes = config.camera_info_topics, config.boxes
-        return config.model_copy(
-            update={
-                "lidar_topics": tuple(map(resolve, config.lidar_topics)),
-                "camera_topics": tuple(map(resolve, config.camera_topics)),
-                "camera_info_topics": {resolve(image): resolve(info) for image, info in infos.items()},
-                "odometry_topic": config.odometry_topic and resolve(config.odometry_topic),
-                "boxes": {key: resolve(path) if key == "topic" else path for key, path in boxes.items()},
-                "lidar_calibration": {resolve(name): file for name, file in config.lidar_calibration.items()},
-            }
-        )
+        return _renamed(self._config.source, self._resolve)
 
     @cached_property
     def _stages(self) -> dict[str, str]:
@@ -328,21 +299,29 @@ def _without_absent(topics: list[Topic], config: SourceConfig) -> tuple[list[Top
     A stated topic that is absent is waited for. No other topic may take its role meanwhile.
     """
     names = {topic.name for topic in topics}
-    changes: dict[str, Any] = {}
-    for key, kinds in (("lidar_topics", {*CLOUDS}), ("camera_topics", {*IMAGES})):
-        stated_names = getattr(config, key)
-        changes[key] = tuple(name for name in stated_names if name in names)
-        if stated_names and not changes[key]:
+    present = _renamed(config, lambda name: name if name in names else "")
+    for stated, left, kinds in (
+        (config.lidar_topics, present.lidar_topics, CLOUDS),
+        (config.camera_topics, present.camera_topics, IMAGES),
+        (config.odometry_topic, present.odometry_topic, ("Odometry",)),
+    ):
+        if stated and not left:
             topics = [topic for topic in topics if topic.kind not in kinds]
-    changes["camera_info_topics"] = {
-        image: info for image, info in config.camera_info_topics.items() if {image, info} <= names
-    }
-    if config.boxes.get("topic", "") not in names:
-        changes["boxes"] = {}
-    changes["lidar_calibration"] = {
-        name: file for name, file in config.lidar_calibration.items() if name in names
-    }
-    if config.odometry_topic and config.odometry_topic not in names:
-        changes["odometry_topic"] = ""
-        topics = [topic for topic in topics if topic.kind != "Odometry"]
-    return topics, config.model_copy(update=changes)
+    return topics, present
+
+
+def _renamed(config: SourceConfig, rename: Callable[[str], str]) -> SourceConfig:
+    """Return the configuration with topics renamed. A topic whose new name is empty is left out."""
+    infos = {rename(image): rename(info) for image, info in config.camera_info_topics.items()}
+    boxes = {key: rename(value) if key == "topic" else value for key, value in config.boxes.items()}
+    files = {rename(name): file for name, file in config.lidar_calibration.items()}
+    return config.model_copy(
+        update={
+            "lidar_topics": tuple(filter(None, map(rename, config.lidar_topics))),
+            "camera_topics": tuple(filter(None, map(rename, config.camera_topics))),
+            "camera_info_topics": {image: info for image, info in infos.items() if image and info},
+            "odometry_topic": config.odometry_topic and rename(config.odometry_topic),
+            "boxes": boxes if boxes.get("topic") else {},
+            "lidar_calibration": {name: file for name, file in files.items() if name},
+        }
+    )

@@ -127,11 +127,6 @@ class CurrentProblems:
             problems = [replace(problem) for problem in self._problems.values() if problem.end is None]
         return sorted(problems, key=lambda problem: problem.since)
 
-    @property
-    def sentences(self) -> list[str]:
-        """The same as sentences."""
-        return [str(problem) for problem in self.current]
-
     def of(self, subject: str) -> list[Problem]:
         """Return the current problems of a topic, sensor, viewer or stage."""
         return [problem for problem in self.current if problem.finding.subject == subject]

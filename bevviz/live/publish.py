@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from bevviz.config import Config
 from bevviz.live.status import Notes
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import (
@@ -44,35 +43,50 @@ TOPICS = {
 }
 
 
-class ResultSink(Protocol):
-    """Receiver of serialised results by topic."""
+class Receiver:
+    """Base class of receivers of the results. Each method may stay as it is. One thread calls all."""
+
+    def observe(self, result: FrameResult) -> None:
+        """Take a result. Only the newest comes."""
 
     def wants(self, topic: str) -> bool:
-        """Return whether anybody receives a topic."""
+        """Return whether anybody receives a topic of ``TOPICS``."""
+        return False
 
     def send(self, topic: str, data: bytes, stamp: int) -> None:
         """Send a message in CDR with its stamp in nanoseconds."""
 
 
-class Publisher:
-    """Publisher of each result that somebody receives, with the header of its cloud or image.
+class Publisher(Observer[FrameResult]):
+    """Observer that publishes each result that somebody receives, with the header of its cloud or image.
 
     Clusters are the kept ones, with ``cluster_<row>`` as their class. Fused boxes are the objects with a
     class. Their class is the second result, after ``cluster_<row>``, where the tutorial's nodes look for it.
     Tracks have their number as ``id``, and their speed as the second result. Any RViz shows them as markers.
 
     Args:
-        config: selects the boxes of the clusters.
-        sinks: receivers of the messages.
+        receivers: receivers of the messages.
+        notes: takes a warning the first time that publishing fails.
     """
 
-    def __init__(self, config: Config, sinks: Sequence[ResultSink]) -> None:
-        self._config, self._sinks = config, sinks
+    name = "publishing"
+    queue_size = 1
+
+    def __init__(self, receivers: Sequence[Receiver], notes: Notes) -> None:
+        self._receivers, self._notes = receivers, notes
+        self._failed = False
         self._stamp = 0
 
-    def configure(self, config: Config) -> None:
-        """Set the configuration."""
-        self._config = config
+    def observe(self, result: FrameResult) -> None:
+        """Publish a result, and show it to the receivers."""
+        try:
+            self.publish(result)
+            for receiver in self._receivers:
+                receiver.observe(result)
+        except Exception as error:
+            if not self._failed:
+                self._notes.warn(f"results cannot be published: {type(error).__name__}: {error}")
+            self._failed = True
 
     def publish(self, result: FrameResult) -> None:
         """Publish the results of a frame. Several cameras take turns on one topic."""
@@ -86,7 +100,7 @@ class Publisher:
             self._send(OBSTACLES, encode_cloud(Cloud(stamp, frame_id, _moved(result.obstacles, back))))
         if result.clusters is not None and self._wanted(CLUSTERS):
             rows = np.flatnonzero(result.clusters.kept)
-            boxes = _rows(result.clusters.boxes(self._config.clustering), rows)
+            boxes = _rows(result.clusters.boxes(result.config.clustering), rows)
             names = [[(f"cluster_{row}", 1.0)] for row in rows]
             self._send(CLUSTERS, encode_boxes_3d(stamp, frame_id, boxes, names, back))
         if self._wanted(DETECTIONS):
@@ -139,14 +153,14 @@ class Publisher:
         )
 
     def _wanted(self, topic: str) -> bool:
-        return any(sink.wants(topic) for sink in self._sinks)
+        return any(receiver.wants(topic) for receiver in self._receivers)
 
     def _send(self, topic: str, message: Any) -> None:
         """Serialise a message and pass it to everyone who receives its topic."""
         data = bytes(typestore().serialize_cdr(message, TOPICS[topic]))
-        for sink in self._sinks:
-            if sink.wants(topic):
-                sink.send(topic, data, self._stamp)
+        for receiver in self._receivers:
+            if receiver.wants(topic):
+                receiver.send(topic, data, self._stamp)
 
 
 def _moved(points: F32, pose: F64 | None) -> F32:
@@ -156,23 +170,3 @@ def _moved(points: F32, pose: F64 | None) -> F32:
 
 def _rows(boxes: Boxes3D, rows: I64) -> Boxes3D:
     return Boxes3D(boxes.center[rows], boxes.size[rows], boxes.yaw[rows])
-
-
-class PublishingObserver(Observer[FrameResult]):
-    """Observer that publishes results to the robot, in its own thread."""
-
-    name = "publishing"
-    queue_size = 1
-
-    def __init__(self, publish: Callable[[FrameResult], None], notes: Notes) -> None:
-        self._publish, self._notes = publish, notes
-        self._failed = False
-
-    def observe(self, result: FrameResult) -> None:
-        """Publish a result. Warn once if that fails."""
-        try:
-            self._publish(result)
-        except Exception as error:
-            if not self._failed:
-                self._notes.warn(f"results cannot be published: {type(error).__name__}: {error}")
-            self._failed = True

@@ -23,10 +23,11 @@ from rosbags.interfaces import (
 )
 
 from bevviz.config import LiveConfig
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.live.graph import TRANSFORMS, UNKNOWN, PublishedTopic, Subscriptions, TypeRequests, full_name
 from bevviz.live.node import Node
-from bevviz.messages.definitions import deserialize_cdr, store_of, typestore
+from bevviz.messages.definitions import definition, deserialize_cdr, store_of, typestore
 from bevviz.messages.foreign_boxes import holds_boxes
 
 MEGABYTE = 1_000_000
@@ -98,8 +99,8 @@ class RawRecorder:
     One thread adds messages. Any thread may call everything else.
     """
 
-    def __init__(self, config: LiveConfig) -> None:
-        self.config = config
+    def __init__(self, settings: ReloadableConfig) -> None:
+        self._settings = settings
         self.left_out: dict[str, str] = {}  # published topic that is not recorded -> reason
         self._types: dict[str, str] = {}  # by recorded topic
         self._messages: deque[tuple[float, RawMessage]] = deque()  # with the monotonic time of ``put``
@@ -107,6 +108,11 @@ class RawRecorder:
         self._size = self._since = 0
         self._sink: Sink | None = None
         self._lock = threading.RLock()
+
+    @property
+    def config(self) -> LiveConfig:
+        """Limits in force."""
+        return self._settings.config.live
 
     @property
     def size(self) -> int:
@@ -179,16 +185,16 @@ class RawRecorder:
         newest = {(m.connection.topic, m.connection.msgtype): m.connection for m in messages}
         return [m._replace(connection=newest[m.connection.topic, m.connection.msgtype]) for m in messages]
 
-    def attach(self, sink: Sink, begin: Callable[[list[RawMessage]], None]) -> None:
-        """Pass the held messages to ``begin``, and every later one to ``sink``, in the receiving thread."""
-        with self._lock:
-            begin(self.messages())
-            self._sink = sink
+    def attach(
+        self, sink: Sink, begin: Callable[[list[RawMessage]], None], seconds: float | None = None
+    ) -> None:
+        """Pass the messages of the last seconds, or all, to ``begin``, and every later one to ``sink``.
 
-    def begin_again(self, begin: Callable[[list[RawMessage]], None]) -> None:
-        """Pass the messages that a new bag needs to ``begin``. No message comes meanwhile."""
+        No message comes between them. The receiving thread calls ``sink``.
+        """
         with self._lock:
-            begin(self.messages(LEAD))
+            begin(self.messages(seconds))
+            self._sink = sink
 
     def detach(self) -> None:
         """Stop passing messages to the sink."""
@@ -300,8 +306,10 @@ def connection_of(topic: PublishedTopic) -> Connection:
     except UserError:
         digest = ""
     extra = ConnectionExtRosbag2("cdr", [_qos(publisher.qos_profile) for publisher in topic.publishers])
-    nothing = MessageDefinition(MessageDefinitionFormat.NONE, "")
-    return Connection(0, topic.name, topic.type, nothing, digest, 0, extra, _node_names(topic) or None)
+    text = definition(topic.type)
+    form = MessageDefinitionFormat.NONE if text is None else MessageDefinitionFormat.MSG
+    about = MessageDefinition(form, text or "")
+    return Connection(0, topic.name, topic.type, about, digest, 0, extra, _node_names(topic) or None)
 
 
 def _node_names(topic: PublishedTopic) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bevviz.config import LiveConfig
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import Encoder, Packet
 from bevviz.live.files import BagSaver, RecordingSaver, free_names
@@ -38,7 +38,7 @@ class RunOutputs(Closable):
 
     Args:
         wanted: outputs that the user asks for.
-        config: limits of files, buffers and queues.
+        settings: limits of files, buffers and queues.
         encoder: makes the packets.
         notes: takes messages to the user.
         problems: takes the viewers that are behind.
@@ -55,15 +55,15 @@ class RunOutputs(Closable):
     def __init__(
         self,
         wanted: Outputs,
-        config: LiveConfig,
+        settings: ReloadableConfig,
         encoder: Encoder,
         notes: Notes,
         problems: CurrentProblems,
         raw: RawRecorder | None,
     ) -> None:
         self._encoder, self._notes, self._problems = encoder, notes, problems
-        self._indexer = Indexer()
-        self.flight = FlightRecorder(config, encoder, self._indexer, notes, raw)
+        self._indexer, config = Indexer(), settings.config.live
+        self.flight = FlightRecorder(settings, encoder, self._indexer, notes, raw)
         self.urls: list[str] = []
         programs = [remote(url, encoder.application, encoder.recording_id) for url in wanted.connect]
         if wanted.serve is not None:

@@ -9,26 +9,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from bevviz.checks import InputChecks
 from bevviz.compare.robot_comparison import RobotComparison
 from bevviz.config import Config
-from bevviz.config.reloading import ReloadableConfig
+from bevviz.config.reloading import FIXED_KEYS, ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.live.encoder import WHOLE, Encoder
 from bevviz.live.flight_recorder import Triggers
-from bevviz.live.live_settings import LiveSettings
-from bevviz.live.outputs import Output
-from bevviz.live.problems import CurrentProblems
-from bevviz.live.publish import PublishingObserver
-from bevviz.live.raw_recorder import RawRecorder
-from bevviz.live.requests import Control, answer_sigusr1
+from bevviz.live.publish import Publisher, Receiver
+from bevviz.live.requests import answer_sigusr1
 from bevviz.live.result_problems import ResultProblems
 from bevviz.live.run_outputs import Outputs, RunOutputs
 from bevviz.live.source_wrappers import RobotFrames, thinned, warm_up
-from bevviz.live.status import Health, Notes
+from bevviz.live.status import Health, Notes, set_nice
 from bevviz.model.frame import Frame, RobotContext, Scene
 from bevviz.model.protocols import Items, Observer
 from bevviz.model.results import FrameResult
@@ -40,7 +35,6 @@ from bevviz.support.freed_memory import return_freed_memory
 
 LOOK = 1.0  # seconds between two checks of the configuration file and the clock
 PAUSE = 1.0  # seconds without a frame after which the states of the topics are shown without one
-GLANCE = 0.2  # seconds between two looks at them then
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -53,12 +47,16 @@ class Live:
         outputs: outputs of the run.
         notes: takes messages to the user.
         observe: skip the pipeline and log only the robot's topics.
-        on_result: called with each result in its own thread. If it is too slow, it gets the newest.
         loader: loader that has the detector's network already.
-        control: server for requests to save. None: the run opens its own.
-        raw: recorder of the messages from which the source makes frames.
         robot: topic of the robot's boxes to compare with. Empty: its fused boxes. None: no comparison.
+
+    Attributes:
+        source: source of the frames, with the messages they are made of.
         problems: list of current problems, to which the run adds its own.
+        receivers: receivers of the results.
+        watchers: functions that the logging thread calls with each logged result.
+        followers: functions that the thread of ``run`` calls with each new configuration.
+        settings: the configuration, which any thread may change.
 
     Raises:
         UserError: the detector's model, an output or the blueprint cannot be used.
@@ -72,43 +70,37 @@ class Live:
         notes: Notes,
         *,
         observe: bool = False,
-        on_result: Callable[[FrameResult], None] | None = None,
         loader: StageLoader | None = None,
-        control: Control | None = None,
-        raw: RawRecorder | None = None,
         robot: str | None = None,
-        problems: CurrentProblems | None = None,
     ) -> None:
-        self.notes, self.raw, self._control = notes, raw, control
-        self.on_change: Callable[[Config], None] = lambda config: None  # called in the thread of ``run``
+        self.source, self.notes, self.problems = source, notes, source.problems
+        self.receivers: list[Receiver] = []
         self.frames = 0  # frames logged so far
-        self._source = source
-        self.problems = problems or CurrentProblems(notes.warn)
+        self.followers: list[Callable[[Config], None]] = []
         self._results = ResultProblems(self.problems)
-        self._on_result = on_result
         self.checks = InputChecks(source, settings.config)
-        self._shown = settings.config  # the configuration last passed to ``on_change``
         self._over = threading.Event()
         self._asked_to_save = False
-        self._looked = self._logged = self._glanced = 0.0  # seconds, monotonic
+        self._looked = self._logged = 0.0  # seconds, monotonic
         self._states: dict[str, str] = {}  # of the topics, as last logged while no frame came
         live = settings.config.live
 
-        self._observes = observe
-        self.session = (
-            ObservingSession(settings.config) if observe else LiveSession(settings.config, loader=loader)
-        )
-        self._settings = LiveSettings(settings, self.session, notes, self._follow)
-        self.against = None if robot is None else RobotComparison(robot, live)
+        config = settings.config
+        self._shown = config  # the configuration that the followers have
+        self.session = ObservingSession(config) if observe else Session(config, loader=loader)
+        self.session.estimates_motion = False  # The robot's transforms tell it, and an estimate takes time.
+        self.settings, settings.apply = settings, self._apply
+        self._set_nice(live.nice)
+        self.against = None if robot is None else RobotComparison(robot)
         whole = WHOLE if live.viewer_rate is None else 1 / live.viewer_rate
         network = "" if observe else self.session.stages.provider
         self.encoder = Encoder(
             self.config, source.scene, outputs.blueprint, whole, self.against, network=network
         )
-        self.outputs = RunOutputs(outputs, live, self.encoder, notes, self.problems, raw)
+        self.outputs = RunOutputs(outputs, settings, self.encoder, notes, self.problems, source.raw)
         self.flight = self.outputs.flight
-        self._watchers: list[Callable[[FrameResult], None]] = []
-        self._triggers = Triggers(live)
+        self.watchers: list[Callable[[FrameResult], None]] = []
+        self._triggers = Triggers()
         self.health = Health()
         self._dropping = DropPolicy()
 
@@ -122,7 +114,7 @@ class Live:
         """One sentence with the silent topics if no frame comes. Empty: frames come, or none has come yet."""
         if not self.frames or time.monotonic() - self._logged < PAUSE:
             return ""
-        silent = [f"{topic} ({state})" for topic, state in self._source.states.items() if state != "ok"]
+        silent = [f"{topic} ({state})" for topic, state in self.source.states.items() if state != "ok"]
         return f"no frame comes: {', '.join(silent) or 'every topic is late'}"
 
     @property
@@ -135,39 +127,29 @@ class Live:
     @property
     def drops(self) -> dict[str, int]:
         """Dropped frames and messages by cause, without those thinned on purpose."""
-        return {"source": self._source.dropped, **self._dropping.dropped, **self.outputs.dropped}
+        return {"source": self.source.dropped, **self._dropping.dropped, **self.outputs.dropped}
 
     # --- the frames, as the input of ``run`` ---------------------------------------------------
 
     @property
     def scene(self) -> Scene:
         """Names of the sensors."""
-        return self._source.scene
+        return self.source.scene
 
     @property
     def total(self) -> int | None:
         """Number of frames, if known."""
-        return self._source.total
+        return self.source.total
 
     @property
     def warnings(self) -> Sequence[str]:
         """Suspicious data so far, one sentence each."""
-        return self._source.warnings
+        return self.source.warnings
 
     def __iter__(self) -> Iterator[Frame]:
-        return thinned(self._source, lambda: self.config)
+        return thinned(self.source, lambda: self.config)
 
-    # --- outputs and requests ------------------------------------------------------------------
-
-    def attach(self, output: Output, watcher: Callable[[FrameResult], None]) -> None:
-        """Add an output before the run. It is closed at the end of the run.
-
-        Args:
-            output: takes the packets.
-            watcher: called with each logged result, in the logging thread.
-        """
-        self.outputs.attach(output)
-        self._watchers.append(watcher)
+    # --- the state of the run ------------------------------------------------------------------
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -182,14 +164,6 @@ class Live:
         numbers |= {f"dropped: {where}": float(count) for where, count in self.drops.items()}
         numbers |= {f"lag of the {name} viewer, ms": 1e3 * lag for name, lag in self.outputs.lags.items()}
         return numbers | {path.rpartition("/")[2]: n for path, n in self.flight.scalars.items()}
-
-    def save(self, path: Path | None = None) -> Path:
-        """Save the last seconds, see ``FlightRecorder.save``. Any thread may call it."""
-        return self.flight.save(path)
-
-    def mark(self, text: str) -> None:
-        """Mark the next frame, as a message on the topic of marks does."""
-        self._source.mark(text)
 
     def stop(self) -> None:
         """End ``run``. Any thread may call it."""
@@ -211,24 +185,20 @@ class Live:
             if self._asked_to_save:
                 self._asked_to_save = False
                 self.flight.save_soon("SIGUSR1")
-            if time.monotonic() - self._glanced >= GLANCE:
-                self._glanced = time.monotonic()
-                self._log_meanwhile()
+            self._log_meanwhile()
             if time.monotonic() - self._looked >= LOOK:
                 self._looked = time.monotonic()
                 self._check()
                 on_tick()
 
         observers: list[Observer[FrameResult]] = [LoggingObserver(self), self.checks]
-        if self._on_result is not None:
-            observers.append(PublishingObserver(self._on_result, self.notes))
+        if self.receivers:
+            observers.append(Publisher(self.receivers, self.notes))
         return_freed_memory()
         with ExitStack() as stack:
             stack.callback(_handle, {number: signal.getsignal(number) for number in ENDING})
             stack.enter_context(self.session)
             stack.enter_context(self.outputs)
-            if self._control is None:
-                stack.enter_context(Control(self.save, self.notes.warn))
             stack.enter_context(answer_sigusr1(ask_to_save))
             # Closing takes a limited time. Whoever cannot wait for it sends the signal once more.
             stack.callback(_handle, dict.fromkeys(ENDING[2:], signal.SIG_IGN))
@@ -242,32 +212,32 @@ class Live:
 
     def _check(self) -> None:
         """Check the configuration file, the clock, the topics and the viewers."""
-        self._settings.look()
+        if self.settings.changed():
+            try:
+                self.settings.take()
+            except UserError as error:
+                self.notes.warn(f"{error}; the configuration stays as it was")
         if jump := self.health.clock_jump():
             self.notes.warn(f"the clock of this machine has jumped by {jump:+.1f} s")
         self.outputs.check()
         if self._shown is not self.config:
             self._shown = self.config
-            self.on_change(self._shown)
-
-    def warm_up(self) -> None:
-        """Compile and load everything that the first frame needs. Scans of that time count as no drops."""
-        if not self._observes:
-            warm_up(self.config, self.session.loader)
+            for follow in self.followers:
+                follow(self._shown)
 
     def log(self, result: FrameResult) -> None:
         """Encode a frame once, for every output."""
         drops = {entities.DROPS.path(where): float(count) for where, count in self.drops.items()}
         health = self.health.scalars() | drops | self.outputs.scalars
         result = self._with_marks(result)
-        late, states = self._source.overtaken(), self._topic_states()
+        late, states = self.source.overtaken(), self._topic_states()
         boxes = [(late_result.frame_stamp, late_result.boxes) for late_result in late]
         compared = self.against.compare(result, boxes) if self.against is not None else ()
-        notes, scene = self.notes.take(), self._source.scene
+        notes, scene = self.notes.take(), self.source.scene
         self.outputs.put(self.encoder.encode(result, scene, health, notes, late, states, compared))
         self._results.observe(result)
-        for watcher in self._watchers:
-            watcher(result)
+        for watch in self.watchers:
+            watch(result)
         self._logged = time.monotonic()
         self.health.logged(result.frame.received)
         self.frames += 1
@@ -279,7 +249,7 @@ class Live:
     def _with_marks(self, result: FrameResult) -> FrameResult:
         """Return the result with the marks of earlier frames that were dropped. Each states its age."""
         frame = result.frame
-        lost = [mark for mark in self._source.marks(frame.index) if mark.index < frame.index]
+        lost = [mark for mark in self.source.marks(frame.index) if mark.index < frame.index]
         if not lost:
             return result
         around = frame.around or RobotContext()
@@ -306,21 +276,26 @@ class Live:
 
     def _topic_states(self) -> dict[str, str]:
         """Return the states of the topics, by entity path."""
-        return {entities.TOPIC_STATE.path(topic): state for topic, state in self._source.states.items()}
+        return {entities.TOPIC_STATE.path(topic): state for topic, state in self.source.states.items()}
 
-    # --- changes -------------------------------------------------------------------------------
+    def _apply(self, config: Config) -> None:
+        """Apply a configuration and report what changed. The thread that changes it calls this."""
+        nice = self.config.live.nice
+        changed = self.session.configure(config)
+        if config.live.nice != nice:
+            self._set_nice(config.live.nice)
+        for key, change in changed.items():
+            if ".params." in key and "absent" in (change.before, change.after):
+                continue  # the change of the method is reported instead
+            late = "; takes effect at the next start" if key.startswith(FIXED_KEYS) else ""
+            self.notes.info(f"configuration: {key} {change}{late}")
 
-    def update(self, settings: Sequence[str], without: Sequence[str] = ()) -> None:
-        """Apply settings, see ``LiveSettings.update``. Any thread may call it."""
-        self._settings.update(settings, without)
-
-    def _follow(self, config: Config) -> None:
-        """Pass a new configuration to the buffers and to the comparison."""
-        self.flight.config = self._triggers.config = config.live
-        if self.raw is not None:
-            self.raw.config = config.live
-        if self.against is not None:
-            self.against.config = config.live
+    def _set_nice(self, nice: int) -> None:
+        """Set the priority of the process, or warn if that is not permitted."""
+        try:
+            set_nice(nice)
+        except PermissionError:
+            self.notes.warn(f"live.nice={nice}: only root may take priority back")
 
 
 def _handle(handlers: Mapping[signal.Signals, Any]) -> None:
@@ -338,18 +313,13 @@ class LoggingObserver(Observer[FrameResult]):
         self.queue_size = live.config.live.log_queue
 
     def begin(self, items: Items[object]) -> None:
-        """Warm up before the first frame."""
-        self._live.warm_up()
+        """Compile and load everything that the first frame needs. Scans of that time count as no drops."""
+        if not isinstance(self._live.session, ObservingSession):
+            warm_up(self._live.config, self._live.session.loader)
 
     def observe(self, result: FrameResult) -> None:
         """Log a result."""
         self._live.log(result)
-
-
-class LiveSession(Session):
-    """Session that leaves the robot's motion to its transforms: an estimate would delay each result."""
-
-    estimates_motion = False
 
 
 class ObservingSession(Session):

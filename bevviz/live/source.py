@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -14,7 +14,7 @@ from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.live.graph import PublishedTopic, Subscriptions, published_topics
 from bevviz.live.input_problems import InputProblems
-from bevviz.live.inputs import KINDS, SILENCE, STALL, Inputs, TopicWatch
+from bevviz.live.inputs import KINDS, STALL, Inputs, TopicWatch
 from bevviz.live.live_message import LiveMessage
 from bevviz.live.node import Node, add_timer
 from bevviz.live.problems import CurrentProblems
@@ -68,12 +68,11 @@ class LiveSource(Closable):
         results: bool = False,
     ) -> None:
         self.config = config
-        self.lost: Counter[str] = Counter()  # topic -> messages that the middleware lost
         self.topics: dict[str, PublishedTopic] = {}  # topics published by other nodes
         self.problems = CurrentProblems(tell or (lambda text: None))
-        self._watch = TopicWatch(self.problems)
+        self.raw = raw
+        self.watch = TopicWatch(self.problems)
         self._known: dict[str, PublishedTopic] = {}  # topics that may have a role, or had one
-        self._last_cloud = time.monotonic()
         self._settled = threading.Event()
         self._complete = False  # whether the scene is known
         self._lock = threading.RLock()  # guards the state that the receiving thread changes
@@ -84,33 +83,29 @@ class LiveSource(Closable):
         self._marks: deque[UserMark] = deque(maxlen=MARKS)  # marks that no call of ``marks`` has returned
         self._ended = False
 
-        self._node = Node(arguments, on_end=self.stop, name=name)
-        self.node = self._node.node  # rclpy's node for publishing and services, with a thread of its own
-        self.domain = self._node.domain
-        self.middleware = self._node.middleware
-        self._inputs = Inputs(config, self._node.resolve, self.problems, results=results)
-        self.frame_ids = self._inputs.frame_ids  # topic -> frame id of its first message
+        self.nodes = Node(arguments, on_end=self.stop, name=name)
+        self.inputs = Inputs(config, self.nodes.resolve, self.problems, results=results)
         for kind in KINDS:  # To import them takes 0.1 s, in which the receiving thread would receive nothing.
             with suppress(UserError):
                 message_type(kind)
-        requests = [types.TypeRequests(self._node) for types in load_all("message_types", self.problems.tell)]
+        requests = [types.TypeRequests(self.nodes) for types in load_all("message_types", self.problems.tell)]
         self._subscriptions = Subscriptions(
-            self._node, requests, self._locked(self._receive), self._locked(self._count_lost)
+            self.nodes, requests, self._locked(self._receive), self._locked(self._count_lost)
         )
         self._checks = InputProblems(
-            config, self._node, self._inputs, self._subscriptions, self._watch, self.problems
+            config, self.nodes, self.inputs, self._subscriptions, self.watch, self.problems
         )
-        self._raw = None if raw is None else RawTopics(self._node, raw, requests)
+        self._raw_topics = None if raw is None else RawTopics(self.nodes, raw, requests)
         # Subscribed before it is published, because a mark may be sent once only.
-        self._mark = PublishedTopic(self._node.resolve(MARK), "std_msgs/msg/String", ())
-        add_timer(self._node.input, LOOK, self._locked(self._follow_graph))
-        add_timer(self._node.input, TICK, self._locked(self._tick))
-        self._node.start()
+        self._mark = PublishedTopic(self.nodes.resolve(MARK), "std_msgs/msg/String", ())
+        add_timer(self.nodes.input, LOOK, self._locked(self._follow_graph))
+        add_timer(self.nodes.input, TICK, self._locked(self._tick))
+        self.nodes.start()
 
     def close(self) -> None:
         """Leave the graph."""
         self.stop()
-        self._node.close()
+        self.nodes.close()
 
     def stop(self) -> None:
         """End the iteration. Any thread may call it."""
@@ -121,18 +116,12 @@ class LiveSource(Closable):
     @property
     def roles(self) -> Roles:
         """Roles of the topics."""
-        return self._inputs.roles
+        return self.inputs.roles
 
     @property
     def dropped(self) -> int:
         """Frames replaced by newer ones before they were taken, since the iteration began."""
         return self._handover.dropped - (self._dropped_before or 0)
-
-    @property
-    def tree(self) -> Mapping[str, str]:
-        """Parent of each child frame, of the transforms received so far."""
-        with self._lock:
-            return dict(self._inputs.sync.tf.tree())
 
     # --- as a source ---------------------------------------------------------------------------
 
@@ -155,17 +144,16 @@ class LiveSource(Closable):
         """Return the data that a first frame would lack, the worst first."""
         if not self.topics:
             return [
-                f"nothing is published on ROS domain {self._node.domain}: is the robot running, with this "
+                f"nothing is published on ROS domain {self.nodes.domain}: is the robot running, with this "
                 f"ROS_DOMAIN_ID, and not limited to its own machine (ROS_AUTOMATIC_DISCOVERY_RANGE)?"
             ]
-        misstated = list(self._inputs.misstated(self.topics.values()).values())
+        misstated = list(self.inputs.misstated(self.topics.values()).values())
         if not self.roles.lidars:
             return misstated or [self.roles.no_lidar or "no LiDAR yet"]
         used = [*self.roles.lidars, *(camera.topic for camera in self.roles.cameras)]
-        received = self.received
-        silent = [topic for topic in used if not received[topic]]
+        silent = [topic for topic in used if not self.watch.received[topic]]
         none = [f"no message on {', '.join(silent)} yet"] if silent else []
-        return [*misstated, *none, *self._inputs.sync.lacking()] or [CHANGING]
+        return [*misstated, *none, *self.inputs.sync.lacking()] or [CHANGING]
 
     @property
     def scene(self) -> Scene:
@@ -181,23 +169,8 @@ class LiveSource(Closable):
     def warnings(self) -> Sequence[str]:
         """Sentences about what was counted since the start and is no problem of ``problems``."""
         with self._lock:
-            findings, known = list(self._inputs.sync.report.findings()), self.problems.all
+            findings, known = list(self.inputs.sync.report.findings()), self.problems.all
         return [str(finding) for finding in findings if (finding.kind, finding.subject) not in known]
-
-    @property
-    def received(self) -> Counter[str]:
-        """Messages received so far, by topic."""
-        return self._watch.received
-
-    @property
-    def volume(self) -> Counter[str]:
-        """Bytes received so far, by topic."""
-        return self._watch.volume
-
-    def delay(self, topic: str) -> float | None:
-        """Return the median seconds from a stamp to its receipt, or None if unknown."""
-        with self._lock:
-            return self._inputs.sync.clocks.lag(topic)
 
     @property
     def states(self) -> Mapping[str, str]:
@@ -205,9 +178,10 @@ class LiveSource(Closable):
         with self._lock:
             # Topics around the robot and marks are published irregularly.
             shown = {topic for topic, _, _ in self.roles.around} | {self._mark.name}
-            states = self._watch.states(
-                {name: name in self.topics for name in self._subscriptions.topics - shown}
-            )
+            states: dict[str, str] = {
+                name: self.watch.state(name, published=name in self.topics)
+                for name in self._subscriptions.topics - shown
+            }
         doubtful = {problem.finding.subject for problem in self.problems.current}
         return {n: "degraded" if state == "ok" and n in doubtful else state for n, state in states.items()}
 
@@ -217,7 +191,7 @@ class LiveSource(Closable):
             numbers = dict(self._numbers)
             return tuple(
                 replace(late, index=numbers[late.frame_stamp])
-                for late in self._inputs.sync.overtaken()
+                for late in self.inputs.sync.overtaken()
                 if late.frame_stamp in numbers
             )
 
@@ -248,8 +222,8 @@ class LiveSource(Closable):
 
     def _check(self) -> None:
         """Raise the exception that ended the receiving thread, if any."""
-        if self._node.error is not None:
-            raise self._node.error
+        if self.nodes.error is not None:
+            raise self.nodes.error
 
     # --- the receiving thread ------------------------------------------------------------------
 
@@ -263,28 +237,26 @@ class LiveSource(Closable):
         return run
 
     def _count_lost(self, topic: str, count: int) -> None:
-        self.lost[topic] += count
+        self.watch.lost[topic] += count
 
     def _receive(self, published: PublishedTopic, data: bytes, info: dict[str, Any]) -> None:
         """Take in a message and deliver the frames that it completes."""
-        topic, inputs = published.name, self._inputs
+        topic, inputs = published.name, self.inputs
         message = LiveMessage(topic, published.type, info["received_timestamp"] or time.time_ns(), data)
-        if self._raw is not None:
-            self._raw.put(self._known.get(topic, published), message.received, info, data)
-        first = self._watch.count(topic, len(data))
+        if self._raw_topics is not None:
+            self._raw_topics.put(self._known.get(topic, published), message.received, info, data)
+        first = self.watch.count(topic, len(data))
         before = inputs.sync.cameras.intrinsics.get(topic)
         try:
             if first and inputs.learn(message):
                 self._assign()
             if inputs.handle(message):
                 self._assign()
-            self._watch.mark_usable(topic)
+            self.watch.mark_usable(topic)
         except UserError as error:
-            self._watch.mark_unusable(topic, str(error))
+            self.watch.mark_unusable(topic, str(error))
         if before is not None:
             self._compare(topic, before, inputs.sync.cameras.intrinsics[topic])
-        if topic in self.roles.lidars:
-            self._last_cloud = time.monotonic()
         self._deliver(inputs.sync.ready(message.received))
 
     def _compare(self, topic: str, before: Intrinsics, after: Intrinsics) -> None:
@@ -294,18 +266,18 @@ class LiveSource(Closable):
 
     def _tick(self) -> None:
         """Deliver the frames whose clouds have waited long enough."""
-        self._inputs.sync.absent = self._checks.apart.union(self._not_delivering())
-        self._deliver(self._inputs.sync.ready(time.time_ns()))
+        self.inputs.sync.absent = self._checks.apart.union(self._not_delivering())
+        self._deliver(self.inputs.sync.ready(time.time_ns()))
 
     def _not_delivering(self) -> Iterator[str]:
         """Yield the topics for which no frame waits: without a publisher, silent, or not begun in time."""
-        received, lidars = self.received, self.roles.lidars
+        received, lidars = self.watch.received, self.roles.lidars
         published = self._subscriptions.topics & self.topics.keys()
-        for name in self._inputs.handlers:
+        for name in self.inputs.handlers:
             missed = not received[name] and (self._complete or name in lidars)
-            if missed or name not in published or self._watch.silent_for(name):
+            if missed or name not in published or self.watch.silent_for(name):
                 yield name
-        stalled = [name for name in lidars if self._watch.silent_for(name, STALL)]
+        stalled = [name for name in lidars if self.watch.silent_for(name, STALL)]
         if len(stalled) < len(lidars):  # else this process or the whole robot has paused
             yield from stalled
 
@@ -325,30 +297,23 @@ class LiveSource(Closable):
 
     def _follow_graph(self) -> None:
         """Look at the graph: assign roles, subscribe, and report changes."""
-        self.topics = published_topics(self._node, self._inputs.rank)
-        received = self.received
-        known = {name: topic for name, topic in self._known.items() if received[name]}
+        self.topics = published_topics(self.nodes, self.inputs.rank)
+        known = {name: topic for name, topic in self._known.items() if self.watch.received[name]}
         known.setdefault(self._mark.name, self._mark)
-        self._known = known | self._inputs.candidates(self.topics)
+        self._known = known | self.inputs.candidates(self.topics)
         self._assign()
-        if self._raw is not None:
-            self._raw.follow(self.topics, self._subscriptions.topics)
-            self._report_unsaved(self._raw.unknown)
-        no_clouds = self._is_without_clouds
-        self._checks.look(self.topics, self.lost, complete=self._complete, no_clouds=no_clouds)
+        if self._raw_topics is not None:
+            self._raw_topics.follow(self.topics, self._subscriptions.topics)
+            self._report_unsaved(self._raw_topics.unknown)
+        self._checks.look(self.topics, complete=self._complete)
         if not self._complete and self._is_settled():
             self._complete = True
             self._settled.set()
 
-    @property
-    def _is_without_clouds(self) -> bool:
-        """Whether no LiDAR delivers."""
-        return self._complete and time.monotonic() - self._last_cloud > SILENCE
-
     def _is_settled(self) -> bool:
         """Return whether the roles are stable and every sensor delivers, or the patience is over."""
-        calm = time.monotonic() - self._inputs.changed
-        if calm < SETTLE or not any(self.received[topic] for topic in self.roles.lidars):
+        calm = time.monotonic() - self.inputs.changed
+        if calm < SETTLE or not any(self.watch.received[topic] for topic in self.roles.lidars):
             return False
         lacking = [text for text in self._lacking() if text != CHANGING]
         if lacking and calm > PATIENCE:
@@ -356,14 +321,14 @@ class LiveSource(Closable):
         return not lacking or calm > PATIENCE
 
     def _assign(self) -> None:
-        if not self._inputs.assign(self._known):
+        if not self.inputs.assign(self._known):
             return
-        handlers = self._inputs.handlers
+        handlers = self.inputs.handlers
         for name in self._subscriptions.topics - handlers.keys():
             self._subscriptions.drop(name)
         for name in handlers:
-            if self._raw is not None:
-                self._raw.make_room(self._known[name])
+            if self._raw_topics is not None:
+                self._raw_topics.make_room(self._known[name])
             problem = self._subscriptions.listen(self._known[name])
             text = f"{name} is not received: {problem}" if problem else ""
             if problem != "":  # else a publisher may still answer

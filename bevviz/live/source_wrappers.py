@@ -12,6 +12,8 @@ import numpy as np
 
 from bevviz.config import Config
 from bevviz.live.encoder import Encoder, sample_rows
+from bevviz.live.problems import CurrentProblems
+from bevviz.live.raw_recorder import RawRecorder
 from bevviz.model.frame import F64, Camera, Cloud, Frame, Image, Intrinsics, LateBoxes, Scene, UserMark
 from bevviz.model.geometry import inverse
 from bevviz.model.protocols import Items
@@ -26,6 +28,9 @@ CAMERA_FROM_LIDAR: F64 = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0],
 
 class RobotFrames(Items[Frame], Protocol):
     """Frames of a robot as they come, and what is known beside them."""
+
+    problems: CurrentProblems  # what is wrong with the input, to which a run adds its own
+    raw: RawRecorder | None  # recorder of the messages from which the frames are made
 
     @property
     def dropped(self) -> int:

@@ -54,7 +54,7 @@ def robot_session(live: Live) -> WorkbenchSession:
     """Return the workbench session of a live run that has not started."""
     robot = RunningRobot(live)
     folder = Path(live.config.live.flight_folder).absolute()
-    reports = None if live.raw is None else ReportMaker(robot.news.tell, robot.bag_of, folder)
+    reports = None if live.source.raw is None else ReportMaker(robot.news.tell, robot.bag_of, folder)
     return WorkbenchSession(robot, reports)
 
 
@@ -86,7 +86,8 @@ class RunningRobot(GrowingDrive):
         self._settings: Settings = ()  # settings that pages have changed
         encoder = live.encoder
         self._marker = PieceLogger(encoder.application, encoder.recording_id, live.config, live.scene)
-        live.attach(self.recording, self.observe)
+        live.outputs.attach(self.recording)
+        live.watchers.append(self.observe)
         self.recording.news.listen(self.news.tell)  # There is news while no frame comes, too.
 
     def close(self) -> None:
@@ -147,7 +148,7 @@ class RunningRobot(GrowingDrive):
 
     def _forget_gone(self) -> None:
         """Forget the frames whose messages and results are gone, and find the first of the others."""
-        raw = self.live.raw
+        raw = self.live.source.raw
         oldest = math.inf if raw is None else raw.since + BEFORE
         with self._lock:
             newest = {result.frame.index for result in self._newest}
@@ -267,7 +268,7 @@ class RunningRobot(GrowingDrive):
                 return bag, bag.frames[number]
         with self._lock:
             frames = {n: facts for n, facts in self._facts.items() if facts.stamp >= self._start}
-        raw = self.live.raw
+        raw = self.live.source.raw
         if raw is None or number not in frames:
             raise UserError(f"frame {number} is gone: hold one with H, and ask then")
         self._bags.append(HeldSeconds(raw.messages(), frames))
@@ -289,7 +290,7 @@ class RunningRobot(GrowingDrive):
 
     def robot_questions(self, number: int) -> RobotQuestions | None:
         """Return the questions about the robot's chain in the held seconds, see ``GrowingDrive``."""
-        if self.live.raw is None or len(self.live.raw.object_topics) < 2:
+        if self.live.source.raw is None or len(self.live.source.raw.object_topics) < 2:
             return None
         frame = self.look(number).frame
         end = frame.received + AFTER
@@ -339,7 +340,7 @@ class RunningRobot(GrowingDrive):
         """
         before = self.look(number)
         if settings != self._settings:
-            self.live.update(settings, without=self._settings)
+            self.live.settings.take(settings, without=self._settings)
         self._settings = settings
         return before, self._perceived(before.frame, self.live.config)
 
@@ -378,13 +379,13 @@ class RunningRobot(GrowingDrive):
 
     def _snap(self, message: Snap) -> Said:
         """Save the flight recorder."""
-        return {"type": "said", "text": f"saved in {self.live.save()}"}
+        return {"type": "said", "text": f"saved in {self.live.flight.save()}"}
 
     def _mark(self, message: Mark) -> Said:
         """Mark the shown frame, as a message on the robot's topic of marks does, and on the terminal."""
         number = self.number_at(round(message["time"]))
         text = message["text"].strip() or "look here"
-        self.live.mark(f"{text} (frame {number})")
+        self.live.source.mark(f"{text} (frame {number})")
         text = f"mark at frame {number}: {text}"
         self.live.notes.info(text)
         return {"type": "said", "text": text}

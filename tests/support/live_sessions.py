@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 from bevviz.bags.message import RawMessage
 from bevviz.config.reloading import ReloadableConfig
+from bevviz.live.publish import Receiver
 from bevviz.live.raw_recorder import RawMessage as RecordedMessage
 from bevviz.live.raw_recorder import RawRecorder
 from bevviz.live.run_outputs import Outputs
@@ -17,6 +18,16 @@ from bevviz.model.results import FrameResult
 from bevviz.workbench.running_robot import RunningRobot
 from tests.support import kept_drives
 from tests.support.replay import Replay
+
+
+class CalledReceiver(Receiver):
+    """Receiver that passes each result to a function."""
+
+    def __init__(self, call: Callable[[FrameResult], object]) -> None:
+        self._call = call
+
+    def observe(self, result: FrameResult) -> None:
+        self._call(result)
 
 
 def run_beside(live: Live, during: Callable[[], object]) -> None:
@@ -49,18 +60,13 @@ def live_bench(
     ``messages`` are those that the frames were made of.
     """
     values = ReloadableConfig(None, ["detector.model=demo", *settings])
-    raw = RawRecorder(values.config.live) if messages else None
+    raw = RawRecorder(values) if messages else None
     for message in messages:
         assert raw is not None
         raw.put(RecordedMessage(message.connection, message.received, message.received, bytes(message.data)))
     source = Replay([result.frame for result in results], kept_drives.scene())
-    live = Live(
-        source,
-        values,
-        Outputs(),
-        Notes(lambda line: None),
-        raw=raw,
-    )
+    source.raw = raw
+    live = Live(source, values, Outputs(), Notes(lambda line: None))
     with RunningRobot(live) as bench:
         yield bench
         live.encoder.close()

@@ -7,15 +7,19 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from bevviz.live.problems import CurrentProblems
 from bevviz.model.frame import Frame, LateBoxes, Scene, UserMark
 
 if TYPE_CHECKING:
     from bevviz.cli.live import LiveOptions
     from bevviz.config.reloading import ReloadableConfig
     from bevviz.live.companions import Companion
+    from bevviz.live.raw_recorder import RawRecorder
+    from bevviz.live.run_outputs import Outputs
     from bevviz.live.status import Notes
     from bevviz.pipeline.stage_loader import StageLoader
 
@@ -41,6 +45,8 @@ class Replay:
         self.scene = replace(scene, bag=(), topics=())  # A robot has no bag.
         self.total = total
         self.warnings: tuple[str, ...] = ()
+        self.problems = CurrentProblems(lambda text: None)
+        self.raw: RawRecorder | None = None
         self._frames = [*frames, *frames[-2:0:-1]]
         self._period = 1 / rate
         self._stopped = threading.Event()
@@ -95,21 +101,29 @@ def main() -> int:
     """Run ``bevviz live`` on scans of the synthetic drive in place of a robot."""
     from bevviz.cli import live
     from bevviz.cli import main as run_command
+    from bevviz.errors import UserError
     from bevviz.extras.demo.drive import SyntheticSource
+    from bevviz.live.requests import Control
 
     count, *arguments = sys.argv[1:]
 
     def run(
         settings: ReloadableConfig,
         options: LiveOptions,
+        outputs: Outputs,
         notes: Notes,
         loader: StageLoader,
         companions: Sequence[Companion],
     ) -> int:
         simulated = SyntheticSource(int(count))
         source = Replay(list(simulated), simulated.scene)
-        without_graph = [companion for companion in companions if companion.takes_results]
-        return live._watch(source, settings, options, notes, loader, without_graph)
+        source.problems.tell = notes.warn
+
+        def refuse(path: Path | None) -> Path:
+            raise UserError("the run has not begun")
+
+        with Control(refuse, notes.warn) as control:
+            return live._watch(source, settings, options, outputs, notes, loader, companions, control)
 
     live._run = run
     return run_command(arguments)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from bevviz.errors import UserError
 from bevviz.live.companions import Companion
-from bevviz.live.publish import TOPICS
+from bevviz.live.publish import TOPICS, Receiver
 from bevviz.messages.definitions import definition
 from bevviz.recording.ports import check_port
 from bevviz.support.contexts import Closable
@@ -26,6 +26,8 @@ from bevviz.support.queues import NewestQueue
 if TYPE_CHECKING:
     from websockets.http11 import Request, Response
     from websockets.sync.server import ServerConnection
+
+    from bevviz.live.runtime import Live
 
 HOST = "127.0.0.1"
 PORT = 8765  # that of Foxglove's programs
@@ -40,7 +42,7 @@ _MESSAGE = struct.Struct("<BIQ")  # operation, subscription, stamp in nanosecond
 _MESSAGE_DATA = 1  # operation of a binary message with the data of a topic
 
 
-class FoxgloveServer(Companion):
+class FoxgloveServer(Companion, Receiver):
     """Server of the topics of ``--publish``, and of the pose of the robot, as ROS 2 messages.
 
     It listens on this machine alone, and takes nothing from its clients. The protocol has no password. A
@@ -101,6 +103,10 @@ class FoxgloveServer(Companion):
             client.close()
         self._server.shutdown()
         self._thread.join()
+
+    def begin(self, live: Live) -> None:
+        """Take the results of the run."""
+        live.receivers.append(self)
 
     def wants(self, topic: str) -> bool:
         """Return whether a client is subscribed to a topic."""

@@ -88,6 +88,10 @@ class ChainStep:
     names: Mapping[str, str] = field(default_factory=dict)
     keeps_ids: bool = False
 
+    def outcome(self, parent: str, state: State, text: str, row: int = -1) -> StepOutcome:
+        """Return what the step did with an object of a parent."""
+        return StepOutcome(self.topic, parent, state, f"{self.topic}: {text}", row)
+
 
 @dataclass(frozen=True, slots=True)
 class StepOutcome:
@@ -382,21 +386,20 @@ class RobotChain:
         message = self._stamps[step.topic].get(stamp) or self.nearest(step.topic, stamp)
         source = step.parents[0] if step.parents else ""
         if message is None and self._ends_before(step, stamp):
-            return StepOutcome(step.topic, source, "unknown", f"{step.topic}: {ENDED}"), None
+            return step.outcome(source, "unknown", ENDED), None
         if message is None:
-            text = f"{step.topic}: no message at that time"
-            return StepOutcome(step.topic, source, "message lost", text), None
+            return step.outcome(source, "message lost", "no message at that time"), None
         steps = np.linalg.norm(message.center[:, :2] - where[:2], axis=1)
         row = int(steps.argmin()) if len(steps) else -1
         if row < 0 or steps[row] > reach:
-            text = f"{step.topic}: nothing there{f', made from {source}' if source else ''}"
-            return StepOutcome(step.topic, source, "not made", text), message
+            made = f", made from {source}" if source else ""
+            return step.outcome(source, "not made", f"nothing there{made}"), message
         late = (message.received - message.stamp) / SECOND
         if step.parents and _is_late(late, step):
-            text = f"{step.topic}: has it, {late:.2f} s after its stamp instead of {step.delay:.2f} s"
-            return StepOutcome(step.topic, source, "delayed", text, row), message
-        text = f"{step.topic}: has it, {message.labels[row] or 'without a name'}"
-        return StepOutcome(step.topic, source, "kept", text, row), message
+            text = f"has it, {late:.2f} s after its stamp instead of {step.delay:.2f} s"
+            return step.outcome(source, "delayed", text, row), message
+        text = f"has it, {message.labels[row] or 'without a name'}"
+        return step.outcome(source, "kept", text, row), message
 
     def _ends_before(self, step: ChainStep, time: int) -> bool:
         """Return whether the messages end before the one that a step makes of an earlier one."""
@@ -414,30 +417,26 @@ class RobotChain:
         message = self._child_of(step, parent, before)
         name = before.labels[row] or "the object"
         if message is None and self._ends_before(step, before.received):
-            return StepOutcome(step.topic, parent, "unknown", f"{step.topic}: {ENDED}"), None
+            return step.outcome(parent, "unknown", ENDED), None
         if message is None:
-            text = f"{step.topic}: no message was made from that of {parent}"
-            return StepOutcome(step.topic, parent, "message lost", text), None
+            return step.outcome(parent, "message lost", f"no message was made from that of {parent}"), None
         gate = max(0.5, 3 * step.moved)
         found = int(np.append(_partners(before, message, gate, by_ids=step.keeps_ids), -1)[row])
         if found < 0:
-            text = f"{step.topic}: {name} of {parent} is not there: dropped"
-            return StepOutcome(step.topic, parent, "dropped", text), message
+            return step.outcome(parent, "dropped", f"{name} of {parent} is not there: dropped"), message
         move = float(np.linalg.norm(message.center[found] - before.center[row]))
         usual, label = step.names.get(before.labels[row], message.labels[found]), message.labels[found]
         took = (message.received - before.received) / SECOND
         if move > gate:
-            text = f"{step.topic}: moved by {move:.1f} m; nine of ten objects by less than {step.moved:.1f} m"
-            return StepOutcome(step.topic, parent, "moved", text, found), message
+            text = f"moved by {move:.1f} m; nine of ten objects by less than {step.moved:.1f} m"
+            return step.outcome(parent, "moved", text, found), message
         if label != usual:
-            text = f"{step.topic}: renamed from {name} to {label or 'nothing'}"
-            return StepOutcome(step.topic, parent, "renamed", text, found), message
+            text = f"renamed from {name} to {label or 'nothing'}"
+            return step.outcome(parent, "renamed", text, found), message
         if _is_late(took, step) and parent == step.parents[0]:
-            text = f"{step.topic}: {took:.2f} s after {parent} instead of {step.delay:.2f} s"
-            return StepOutcome(step.topic, parent, "delayed", text, found), message
-        return StepOutcome(
-            step.topic, parent, "kept", f"{step.topic}: kept as {label or name}", found
-        ), message
+            text = f"{took:.2f} s after {parent} instead of {step.delay:.2f} s"
+            return step.outcome(parent, "delayed", text, found), message
+        return step.outcome(parent, "kept", f"kept as {label or name}", found), message
 
     def _child_of(self, step: ChainStep, parent: str, before: ObjectMessage) -> ObjectMessage | None:
         """Return the message of a topic that was made from one of its parent."""

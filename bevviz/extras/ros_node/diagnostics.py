@@ -9,6 +9,7 @@ from typing import Any
 from bevviz.extras.ros_node.topics import open_publisher
 from bevviz.live.node import add_timer
 from bevviz.live.problems import Problem
+from bevviz.live.publish import Receiver
 from bevviz.messages.definitions import typestore
 from bevviz.messages.encode import make_header, make_message
 from bevviz.messages.surroundings import LEVELS
@@ -20,7 +21,7 @@ PERIOD = 1.0  # seconds, the usual period of diagnostic_updater
 OK, WARN, ERROR = range(3)
 
 
-class Diagnostics:
+class Diagnostics(Receiver):
     """Publisher of the state of the run, each second, with or without frames.
 
     ``NAME: pipeline`` has latencies, drops and failed stages. ``NAME: anomalies`` has the anomalies of the

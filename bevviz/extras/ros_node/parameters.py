@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from bevviz.config import TUTORIAL_NAMES, Config, Parameter, parameters, values
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
 
 NO_LIMIT = 0  # a ROS parameter cannot be empty
@@ -17,14 +18,15 @@ class RosRequests:
     """ROS parameters for every key of the configuration, and the service ``~/save_recording``.
 
     Each key is a parameter (``clustering.eps``). The tutorial's names (``range_x``, ``voxel_size`` ...) exist
-    too. Values given with ``--ros-args -p`` are applied before the constructor returns. ``config``,
-    ``change`` and ``save`` may be replaced later.
+    too. Values given with ``--ros-args -p`` are applied before the constructor returns.
 
     Args:
         node: an rclpy node that another thread spins.
-        config: initial values of the parameters.
-        change: applies settings ``key=value``, or raises a UserError with the reason.
+        settings: the configuration, which takes the values.
         save: writes the recording of the last seconds and returns its path, or raises a UserError.
+
+    Attributes:
+        save: as above. It may be replaced.
 
     Raises:
         UserError: a value given with ``-p`` is refused.
@@ -33,22 +35,19 @@ class RosRequests:
     def __init__(
         self,
         node: Any,
-        config: Config,
-        change: Callable[[list[str]], None],
+        settings: ReloadableConfig,
         save: Callable[[], Path] | None = None,
     ) -> None:
-        self._node = node
-        self.config = config
-        self.change = change
-        self.save = save
+        self._node, self._configuration, self.save = node, settings, save
+        config = settings.config
         about = parameters(config)
         self._keys = {**{key: key for key in about}, **TUTORIAL_NAMES}  # parameter name -> key
         declared = [
             node.declare_parameter(name, value, _descriptor(about[self._keys[name]].text))
             for name, value in self._parameters(config).items()
         ]
-        if settings := self._settings(declared):
-            change(settings)
+        if changed := self._settings(declared):
+            settings.take(changed)
         # Ranges come after the first change, so that a wrong value given with ``-p`` gets our sentence.
         for name, key in self._keys.items():
             if (descriptor := _descriptor_with_range(about[key], config)) is not None:
@@ -63,7 +62,6 @@ class RosRequests:
         """Set the parameters to a configuration that was changed elsewhere."""
         from rclpy.parameter import Parameter
 
-        self.config = config
         parameters = self._parameters(config).items()
         self._node.set_parameters(
             [Parameter(n, value=v) for n, v in parameters if self._node.get_parameter(n).value != v]
@@ -81,7 +79,8 @@ class RosRequests:
 
     def _settings(self, parameters: Sequence[Any]) -> list[str]:
         """Return the parameters that differ from the configuration, as settings ``key=value``."""
-        current, unchanged = values(self.config), self._parameters(self.config)
+        config = self._configuration.config
+        current, unchanged = values(config), self._parameters(config)
         ordered = []
         for parameter in parameters:
             name, value = parameter.name, parameter.value
@@ -99,7 +98,7 @@ class RosRequests:
 
         try:
             if settings := self._settings(parameters):
-                self.change(settings)
+                self._configuration.take(settings)
         except UserError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

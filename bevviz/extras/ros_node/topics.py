@@ -9,7 +9,7 @@ from typing import Any
 from bevviz.errors import UserError
 from bevviz.live.graph import UNKNOWN, foreign_publishers, full_name
 from bevviz.live.node import add_timer
-from bevviz.live.publish import TOPICS, TRANSFORMS
+from bevviz.live.publish import TOPICS, TRANSFORMS, Receiver
 from bevviz.live.typesupport import message_type
 
 LOOK = 0.5  # seconds between two looks for other publishers of our topics
@@ -48,7 +48,7 @@ def rename_advice(topic: str) -> str:
     return f"--ros-args -r {topic}:=/bevviz{topic} gives ours another name"
 
 
-class RosTopics:
+class RosTopics(Receiver):
     """Publishers of a ROS node. A topic that another node publishes is left to that node.
 
     If another node begins to publish a topic later, ours ends there, and does not begin again: a robot that

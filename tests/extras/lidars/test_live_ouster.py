@@ -54,7 +54,7 @@ def test_scans_wait_for_metadata_and_end_with_the_next_scan() -> None:
             for _ in range(10):
                 scan()
             waiting = f"{LIDAR} holds packets of an Ouster whose metadata are waited for on {METADATA}"
-            assert waiting in source.missing and not source.received[LIDAR]
+            assert waiting in source.missing and not source.watch.received[LIDAR]
 
             described = graph.advertise(METADATA, STRING)
             graph.advance(0.5)

@@ -14,6 +14,7 @@ import bevviz
 from bevviz.bags.source import BagSource
 from bevviz.cli import main
 from bevviz.config import load
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.extras.robot_chain.chain import ObjectMessage, RobotChain, verdict
 from bevviz.extras.robot_chain.messages import FollowedObject
@@ -247,7 +248,7 @@ def test_the_nodes_of_a_running_robot_are_named() -> None:
     from bevviz.live.source import LiveSource
 
     config = load()
-    raw = RawRecorder(config.live)
+    raw = RawRecorder(ReloadableConfig())
     with (
         own_graph(),
         chained_robot.chained_robot(),

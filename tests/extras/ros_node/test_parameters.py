@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'bevviz[ros]'")
 
-from bevviz.config import Config, load, parameters
+from bevviz.config import load, parameters
+from bevviz.config.reloading import ReloadableConfig
 from bevviz.errors import UserError
 from bevviz.extras.ros_node.parameters import RosRequests
 from bevviz.live.node import Node
@@ -27,13 +28,19 @@ def test_parameters_set_the_configuration() -> None:
     from rclpy.parameter import Parameter
     from std_srvs.srv import Trigger
 
-    config = load(preset="reference")
     ordered: list[str] = []
 
-    def change(settings: list[str]) -> None:
-        nonlocal config
-        config = load(settings=settings, preset="reference")
-        ordered.extend(settings)
+    class OrderedConfig(ReloadableConfig):
+        def take(self, more: Sequence[str] = (), without: Sequence[str] = ()) -> None:
+            super().take(more, without)
+            ordered.extend(more)
+
+    settings = OrderedConfig(preset="reference")
+
+    def show(*more: str) -> None:
+        """Put another configuration in force, as a page does."""
+        settings.config = load(settings=more, preset="reference")
+        orders.show(settings.config)
 
     full = False
 
@@ -44,7 +51,7 @@ def test_parameters_set_the_configuration() -> None:
 
     with Node() as session:
         node = session.node
-        orders = RosRequests(node, config, change, save)
+        orders = RosRequests(node, settings, save)
 
         def set_to(name: str, value: Any) -> Any:
             return node.set_parameters([Parameter(name, value=value)])[0]
@@ -52,10 +59,10 @@ def test_parameters_set_the_configuration() -> None:
         assert node.get_parameter("range_x").value == 10.0
         assert set_to("range_x", 25).successful  # an integer, as `ros2 param set` makes of it
         assert set_to("max_cluster_size", 500).successful
-        assert config.clustering.max_cluster_points == 500
-        orders.show(config)
+        assert settings.config.clustering.max_cluster_points == 500
+        orders.show(settings.config)
         assert set_to("max_cluster_size", 0).successful
-        assert config.clustering.max_cluster_points is None
+        assert settings.config.clustering.max_cluster_points is None
         assert ordered == [
             "bev.range_x=25",
             "clustering.max_cluster_points=500",
@@ -67,19 +74,19 @@ def test_parameters_set_the_configuration() -> None:
         assert 0 == allowed.from_value < allowed.to_value < 1000
         assert node.get_parameter("voxel_size").value == 0.05
 
-        orders.show(load(settings=["voxel_size=0.2"], preset="reference"))
+        show("voxel_size=0.2")
         assert node.get_parameter("voxel_size").value == 0.2
         assert len(ordered) == 3, "what is shown is no order"
 
         del ordered[:]
-        settings = {
+        values = {
             "clustering.eps": "60 cm",
             "live.max_rate": 5,
             "live.triggers": ["tf", "stage"],
             "source.lidar_topics": "[/points]",
             "sync.motion_compensation": True,
         }
-        assert all(set_to(name, value).successful for name, value in settings.items())
+        assert all(set_to(name, value).successful for name, value in values.items())
         assert ordered == [
             "clustering.eps=60 cm",
             "live.max_rate=5",
@@ -87,7 +94,7 @@ def test_parameters_set_the_configuration() -> None:
             "source.lidar_topics=[/points]",
             "sync.motion_compensation=true",
         ]
-        orders.show(load(settings=["live.max_rate=5"], preset="reference"))
+        show("live.max_rate=5")
         assert set_to("live.max_rate", "").successful and ordered[-1] == "live.max_rate=null"
         assert not set_to("live.triggers", ["typhoon"]).successful
         assert {name for name in parameters() if not node.has_parameter(name)} == set()
@@ -100,10 +107,10 @@ def test_parameters_set_the_configuration() -> None:
 
 
 def test_parameters_of_the_command_line() -> None:
-    ordered: list[str] = []
+    settings = ReloadableConfig()
     arguments = ["-p", "range_y:=12.5", "-r", "__node:=eye", "-r", "__ns:=/robot1"]
     with Node(arguments) as session:
-        RosRequests(session.node, Config(), ordered.extend)
+        RosRequests(session.node, settings)
         assert session.node.get_fully_qualified_name() == "/robot1/eye"
         assert session.resolve("points") == "/robot1/points"
-    assert ordered == ["bev.range_y=12.5"]
+    assert settings.config.bev.range_y == 12.5
