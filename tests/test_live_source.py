@@ -9,6 +9,8 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from mmap import mmap
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -35,7 +37,7 @@ from bevviz.live import typesupport
 from bevviz.live.graph import PublishedTopic, Subscriptions
 from bevviz.live.input_problems import remedy
 from bevviz.live.raw_recorder import RawRecorder
-from bevviz.live.source import LiveSource
+from bevviz.live.source import CUT_OFF, LiveSource
 from tests.support.fed_graph import NEEDED, FedGraph, Player, fed_graph, joined
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -109,6 +111,17 @@ def test_a_stated_topic_is_waited_for(graph: FedGraph) -> None:
         player.play(NEEDED)
         assert session.source.missing == f"{wrong}; {absent}"
         assert {absent, wrong} <= set(session.said) and not session.frames
+
+
+def test_deleted_shared_memory_is_named(graph: FedGraph, tmp_path: Path) -> None:
+    """The port of a process is mapped and has no name any more, as Fast DDS leaves it after a kill."""
+    graph.advertise("/points", CLOUD)
+    port = tmp_path / "fastrtps_port28415"
+    port.write_bytes(bytes(4096))
+    with joined(graph) as session, port.open("r+b") as file, mmap(file.fileno(), 0):
+        assert session.source.missing == "no message on /points yet"
+        port.unlink()
+        assert session.source.missing == f"no message on /points yet; {CUT_OFF}"
 
 
 def test_info_says_what_is_missing(graph: FedGraph, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from bevviz.live.graph import PublishedTopic, Subscriptions, published_topics
 from bevviz.live.input_problems import InputProblems
 from bevviz.live.inputs import KINDS, STALL, Inputs, TopicWatch
 from bevviz.live.live_message import LiveMessage
-from bevviz.live.node import Node, add_timer
+from bevviz.live.node import Node, add_timer, is_cut_off
 from bevviz.live.problems import CurrentProblems
 from bevviz.live.raw_recorder import RawRecorder, RawTopics
 from bevviz.live.typesupport import message_type
@@ -36,6 +36,10 @@ TICK = 0.05  # seconds between two checks for clouds that have waited long enoug
 SETTLE = 1.0  # seconds without a change of roles after which the scene is complete
 PATIENCE = 3.0  # seconds that missing topics may delay the scene
 CHANGING = "the topics are still changing"
+CUT_OFF = (
+    "Fast DDS has deleted shared memory that this process reads, as it may within 20 s after another was "
+    "killed: end this one and start it again"
+)
 
 
 class LiveSource(Closable):
@@ -152,7 +156,8 @@ class LiveSource(Closable):
             return misstated or [self.roles.no_lidar or "no LiDAR yet"]
         used = [*self.roles.lidars, *(camera.topic for camera in self.roles.cameras)]
         silent = [topic for topic in used if not self.watch.received[topic]]
-        none = [f"no message on {', '.join(silent)} yet"] if silent else []
+        why = f"; {CUT_OFF}" if silent and is_cut_off() else ""
+        none = [f"no message on {', '.join(silent)} yet{why}"] if silent else []
         return [*misstated, *none, *self.inputs.sync.lacking()] or [CHANGING]
 
     @property
