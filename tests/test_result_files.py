@@ -215,6 +215,35 @@ def test_results_of_another_drive_are_told(tmp_path: Path) -> None:
     assert any(said in warning for warning in opened.warnings)
 
 
+@pytest.mark.parametrize(
+    ("stage", "rows", "why"),
+    [
+        (
+            "objects.method",
+            TABLE.format(1, 0) + "1,Car,,0,-1,4,1.6,1.5,0\n",
+            "its centre is not finite: nan, 0, -1",
+        ),
+        ("objects.method", TABLE.format(1, 0) + "1,Car,9,0,-1,4,-1,1,0\n", "its size is negative: 4, -1, 1"),
+        (
+            "detector.model",
+            "frame,name,x0,y0,x1,y1\n1,Car,5,6,50,60\n1,Car,9,9,3,3\n",
+            "its corners are [9.0, 9.0, 3.0, 3.0]",
+        ),
+    ],
+)
+def test_unusable_boxes_of_a_result_file_are_told(tmp_path: Path, stage: str, rows: str, why: str) -> None:
+    drive = datasets.kitti_object(tmp_path / "training")
+    (tmp_path / "boxes.csv").write_text(rows)
+    opened = open_with(drive, stage, tmp_path / "boxes.csv")
+    frame = opened.raw(1)
+    (labelled,) = frame.robot_boxes or frame.robot_detections
+    assert len(labelled.labels) == len(labelled.scores) == 1
+    assert any(
+        warning.endswith(f"of /results/mine could not be used, the first: box 1 (Car): {why}")
+        for warning in opened.warnings
+    )
+
+
 def test_labels_that_no_object_name_fits_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive, results = datasets.kitti_object(tmp_path / "training"), tmp_path / "preds"
     results.mkdir()

@@ -17,11 +17,11 @@ import numpy as np
 from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, describe_error, files_in
 from bevviz.datasets.kitti_labels import TURN, Calibration, labelled_boxes
 from bevviz.errors import UserError, first_line
-from bevviz.messages.foreign_boxes import check_box_count
+from bevviz.messages.foreign_boxes import BoxRow, box_columns, box_name, boxes_3d, check_box_count
 from bevviz.messages.topics import Topic
 from bevviz.model import geometry
 from bevviz.model.class_names import NUSCENES_CLASSES
-from bevviz.model.frame import F64, Boxes3D, Frame, LabelledBoxes2D, LabelledBoxes3D
+from bevviz.model.frame import F64, Frame, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.stages.detector.names import COCO_CATEGORIES
 from bevviz.support.files import read_text
 from bevviz.support.limits import JSON_LIMIT, TABLE_LIMIT
@@ -73,22 +73,28 @@ class ResultFile(ABC):
             UserError: the results cannot be used.
         """
 
-    def placed(self, frame: Frame, boxes: Boxes3D, labels: Sequence[str], scores: Any) -> LabelledBoxes3D:
+    def placed(self, frame: Frame, rows: Sequence[BoxRow]) -> LabelledBoxes3D:
         """Return boxes in the frame of the points. Raise ValueError if there are too many."""
-        check_box_count(len(labels))
-        values = np.asarray(scores, np.float32)
-        about = self.topic, frame.stamp, frame.points_frame
-        return LabelledBoxes3D(*about, boxes, tuple(labels), values, frame.pose, frame.received)
+        columns = box_columns(rows, 10)
+        boxes = boxes_3d(columns, self.topic, frame.received, frame.stamp, frame.points_frame)
+        scores = np.array([row.score for row in rows], np.float32)[columns.usable]  # 0 is a score here
+        return replace(boxes, scores=scores, turns=None, world_from_boxes=frame.pose)
 
     def in_image(
         self, frame: Frame, xyxy: Any, labels: Sequence[str], scores: Any, camera: str
     ) -> LabelledBoxes2D:
         """Return boxes in the image of a camera. Raise ValueError if there are too many."""
         check_box_count(len(labels))
-        array = np.asarray(xyxy, np.float32).reshape(-1, 4)
-        values = np.asarray(scores, np.float32)
+        corners = np.asarray(xyxy, np.float32).reshape(-1, 4)
+        usable = np.isfinite(corners).all(axis=1) & (corners[:, 2:] > corners[:, :2]).all(axis=1)
+        unusable = tuple(
+            f"{box_name(row, labels[row], '')}: its corners are {corners[row].tolist()}"
+            for row in np.flatnonzero(~usable).tolist()
+        )
+        kept = tuple(labels[row] for row in np.flatnonzero(usable).tolist())
+        values = np.asarray(scores, np.float32)[usable]
         about = self.topic, frame.stamp, ""
-        return LabelledBoxes2D(*about, array, tuple(labels), values, camera, frame.received)
+        return LabelledBoxes2D(*about, corners[usable], kept, values, camera, frame.received, unusable)
 
 
 def open_results(
@@ -225,8 +231,10 @@ class KittiResults(ResultFile):
             scores = [float(row[15]) if len(row) > 15 else 1.0 for row in rows]
             return self.in_image(frame, corners, [row[0] for row in rows], scores, camera)
         labelled = labelled_boxes(file, lines, self._rectified_from_points(frame, file))
-        placed = self.placed(frame, labelled.boxes, labelled.labels, labelled.scores)
-        return replace(placed, unusable=labelled.unusable)
+        placed = replace(
+            labelled, topic=self.topic, stamp=frame.stamp, frame_id=frame.points_frame, image=None
+        )
+        return replace(placed, world_from_boxes=frame.pose, received=frame.received)
 
     def _rectified_from_points(self, frame: Frame, file: Path) -> F64:
         """Return the (4, 4) transform to the frame of KITTI's boxes."""
@@ -259,15 +267,14 @@ class NuScenesResults(ResultFile):
         rows = self._by_stamp.get(frame.stamp)
         if rows is None:
             return None
-        turns = [geometry.yaw(geometry.transform_wxyz(row["translation"], row["rotation"])) for row in rows]
-        boxes = Boxes3D(
-            np.array([row["translation"] for row in rows], np.float64).reshape(-1, 3),
-            np.array([row["size"] for row in rows], np.float32).reshape(-1, 3)[:, [1, 0, 2]],
-            np.array(turns, np.float32),
-        )
-        labels = [NUSCENES_CLASSES.get(row["detection_name"], row["detection_name"]) for row in rows]
-        scores = [row.get("detection_score", 1.0) for row in rows]
-        return replace(self.placed(frame, boxes, labels, scores), world_from_boxes=np.eye(4))
+        boxes = []
+        for row in rows:
+            name, (w, *xyz) = row["detection_name"], row["rotation"]
+            width, length, height = row["size"]
+            numbers = (*row["translation"], length, width, height, *xyz, w)
+            score = float(row.get("detection_score", 1.0))
+            boxes.append(BoxRow(numbers, NUSCENES_CLASSES.get(name, name), score))
+        return replace(self.placed(frame, boxes), world_from_boxes=np.eye(4))
 
 
 class CocoResults(ResultFile):
@@ -338,6 +345,8 @@ class TableResults(ResultFile):
             )
         used = ["frame", self._name, *box, *(columns & {"score", "camera"})]
         self._columns = {column: table.column(column).to_numpy() for column in used}
+        for name in {*box, "score"} & self._columns.keys():
+            self._columns[name] = self._columns[name].astype(np.float64)
         if not self.is_2d and (largest := np.abs(self._columns["yaw"]).max(initial=0)) > TURN:
             raise UserError(
                 f"--results {path}: a yaw of {largest:g} is no angle in radians: is it in degrees?"
@@ -356,12 +365,9 @@ class TableResults(ResultFile):
         scores = values.get("score", np.ones(len(rows)))
         box = np.stack([values[name] for name in (IMAGE_COLUMNS if self.is_2d else BOX_COLUMNS)], axis=1)
         if not self.is_2d:
-            boxes = Boxes3D(
-                np.asarray(box[:, :3], np.float64),
-                box[:, 3:6].astype(np.float32),
-                box[:, 6].astype(np.float32),
-            )
-            return self.placed(frame, boxes, labels, scores)
+            half = box[:, 6:] / 2
+            numbers = np.hstack([box[:, :6], np.zeros((len(box), 2)), np.sin(half), np.cos(half)])
+            return self.placed(frame, list(map(BoxRow, map(tuple, numbers.tolist()), labels, scores)))
         names = [str(name) for name in values.get("camera", ())]
         camera = names[0] if names else next((camera.name for camera in frame.cameras), "")
         return self.in_image(frame, box, labels, scores, camera)
