@@ -222,13 +222,13 @@ def test_undecodable_messages_are_one_line(tmp_path: Path) -> None:
         assert any("of /points could not be used, the first: /points: not a" in w for w in source.warnings)
 
 
-@pytest.mark.parametrize("wrong", [2**70, "text", [1]])
+@pytest.mark.parametrize("wrong", [{"sec": 2**70}, {"sec": "text"}, {"sec": [1]}, "2026-02-30T10:00:00Z"])
 def test_a_time_of_json_that_no_date_has_is_one_line(tmp_path: Path, wrong: object) -> None:
     context, path = foxglove.Context(), tmp_path / "drive.mcap"
     schema = foxglove.Schema(
         name="foxglove.FrameTransform", encoding="jsonschema", data=b'{"type": "object"}'
     )
-    edge = {"parent_frame_id": "map", "child_frame_id": "lidar_top", "timestamp": {"sec": wrong}}
+    edge = {"parent_frame_id": "map", "child_frame_id": "lidar_top", "timestamp": wrong}
     fields = [messages.PackedElementField(name=n, offset=4 * i, type=FLOAT32) for i, n in enumerate("xyz")]
     with foxglove.open_mcap(path, context=context):
         clouds = channels.PointCloudChannel("/LIDAR_TOP", context=context)
@@ -243,6 +243,17 @@ def test_a_time_of_json_that_no_date_has_is_one_line(tmp_path: Path, wrong: obje
     with BagSource([path], load()) as source:
         assert len(list(source)) == 2
         assert any("2 message(s) of /tf could not be used" in text for text in source.warnings)
+
+
+def test_a_cloud_that_ends_within_a_point_is_doubted() -> None:
+    fields = [{"name": name, "offset": 4 * i, "type": 7} for i, name in enumerate("xyz")]
+    data = base64.b64encode(points(0).tobytes()[:-3]).decode()
+    text = json.dumps({"frame_id": "lidar", "point_stride": 16, "fields": fields, "data": data})
+    decoder = find_decoder("foxglove.PointCloud")
+    assert decoder is not None and decoder.from_message is not None
+    cloud = decoder.from_message(parse(text.encode(), "foxglove.PointCloud", "json", ""))
+    assert len(cloud.xyz) == len(points(0)) - 1
+    assert cloud.doubt == "a cloud of points of 16 bytes ends 13 bytes into a point: points may be missing"
 
 
 @pytest.mark.parametrize("kind", ["PointCloud", "CompressedImage", "RawImage"])

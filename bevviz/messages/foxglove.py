@@ -10,6 +10,7 @@ import base64
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from types import SimpleNamespace
@@ -181,7 +182,9 @@ def _cloud(message: Any) -> Cloud:
     pose = _matrix(message.pose) if _is_set(message, "pose") else np.eye(4)
     if not np.array_equal(pose, np.eye(4)):
         points = _transform_points(points, pose)
-    return make_cloud(_stamp(message), _frame(message), points)
+    cloud, cut = make_cloud(_stamp(message), _frame(message), points), len(data) % step
+    doubt = f"a cloud of points of {step} bytes ends {cut} bytes into a point: points may be missing"
+    return replace(cloud, doubt=doubt) if cut else cloud
 
 
 def _transform_points(points: NDArray[np.void], pose: F64) -> NDArray[np.void]:
