@@ -22,6 +22,9 @@ def test_a_job_tells_how_it_ended() -> None:
     def fail(job: Job) -> None:
         raise UserError("bag.mcap: the file has gone")
 
+    def stumble(job: Job) -> None:
+        job.error.index("camera")
+
     jobs.start(Job(0, ("voxel.size=0.2",), total=3), count)
     until(lambda: not jobs.jobs[-1].going)
     head = {"number": 0, "settings": ["voxel.size=0.2"]}
@@ -29,6 +32,9 @@ def test_a_job_tells_how_it_ended() -> None:
     jobs.start(Job(1), fail)
     until(lambda: not jobs.jobs[-1].going)
     assert (jobs.jobs[1].state, jobs.jobs[1].error) == ("failed", "bag.mcap: the file has gone")
+    jobs.start(Job(2), stumble)
+    until(lambda: not jobs.jobs[-1].going)
+    assert (jobs.jobs[2].state, jobs.jobs[2].error) == ("failed", "the count failed: substring not found")
     jobs.end()
     assert told[-1] == "failed"
 

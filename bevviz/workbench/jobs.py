@@ -96,11 +96,11 @@ class Jobs(Generic[J]):
         if self.jobs:
             self.jobs[-1].stop.set()
 
-    def end(self) -> None:
-        """Cancel the newest job, and wait for its end."""
+    def end(self, patience: float | None = None) -> None:
+        """Cancel the newest job, and wait for its end, for these seconds at most."""
         self.cancel()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(patience)
 
     def _run(self, job: J, work: Callable[[J], None]) -> None:
         try:
@@ -109,8 +109,9 @@ class Jobs(Generic[J]):
         except CancelledError:
             job.state = "cancelled"
         except Exception as error:
-            if not isinstance(error, UserError):
-                _log.error("%s failed", self._name, exc_info=error)
-            job.error = str(error) if isinstance(error, UserError) else first_line(error)
+            is_expected = isinstance(error, UserError)
+            job.error = str(error) if is_expected else f"the {self._name} failed: {first_line(error)}"
             job.state = "failed"
+            if not is_expected:
+                _log.error(job.error, exc_info=error)
         self._tell()

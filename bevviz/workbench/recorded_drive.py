@@ -11,7 +11,7 @@ import numpy as np
 
 from bevviz.bags.source import BagSource
 from bevviz.drive import Drive
-from bevviz.errors import UserError, first_line
+from bevviz.errors import UserError
 from bevviz.findings.frame_findings import Finding, find_findings, findings_of
 from bevviz.findings.marks import log_findings
 from bevviz.findings.run_table import RunTable, StoredRun
@@ -27,6 +27,7 @@ from bevviz.why.robot_questions import RobotQuestions, object_topics, robot_ques
 from bevviz.workbench.buffers import AHEAD, BufferReader, PageState, Reader, RecordingBuffer
 from bevviz.workbench.drive_recording import DriveRecording, end_unused_streams
 from bevviz.workbench.growing_drive import GrowingDrive, RunProgress, Settings
+from bevviz.workbench.jobs import Job, Jobs
 from bevviz.workbench.overview import LEAST, NumberedFrames, SingleFrames, overview_order
 from bevviz.workbench.page_overlay import Attempt, PageOverlay
 from bevviz.workbench.run_results import RunResults
@@ -55,7 +56,6 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         recording: recording of the drive.
         lanes: buffers by name: ``recording``, the overlay of each page, and the runs with other values.
         results: results of the run, for the frames that it has reached.
-        over: whether the run over the drive has ended.
         robot_bag: the bag a third time, for the robot's own chain. None: nobody has asked.
     """
 
@@ -79,28 +79,27 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         self.lanes: dict[str, RecordingBuffer] = {"recording": self.recording.rows}
         self._overlays = 0  # number of overlays until now
         self._open_overlays: list[PageOverlay] = []
-        self.results, self.over = RunResults(), False
+        self.results = RunResults()
         self._overview: NumberedFrames | None = None  # while it is made
-        self._done, self._error = 0, ""
+        self._runs: Jobs[Job] = Jobs("run", self.news.tell)
+        self._job = Job(0)  # the run, or its overview
         self._reached = 0  # newest stamp that the run has reached
         self.robot_bag: BagSource | None = None
         self._robot: RobotQuestions | None = None
         self._asking, self._counting = 0, threading.Lock()  # number of questions that are being answered
-        self._stop, self._quiet, self._go = threading.Event(), threading.Event(), threading.Event()
+        self._quiet, self._go = threading.Event(), threading.Event()
         self._quiet.set()
-        self._thread = threading.Thread(target=self._run, name="drive", daemon=True)
 
     def start(self) -> None:
         """Start the run: record the frame that is shown first, then all frames in order."""
-        self._thread.start()
+        self._runs.start(self._job, self._run)
 
     def close(self) -> None:
         """Stop the run, then close the buffers and both sources."""
-        self._stop.set()
+        self._runs.cancel()
         self._quiet.set()
         self._go.set()
-        if self._thread.is_alive():
-            self._thread.join(PATIENCE)
+        self._runs.end(PATIENCE)
         for buffer in self.lanes.values():
             buffer.close()
         self.recording.close()
@@ -123,40 +122,38 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
 
     # --- run -----------------------------------------------------------------------------------
 
+    @property
+    def over(self) -> bool:
+        """Whether the run over the drive has ended."""
+        return not self._job.going
+
     def progress(self) -> RunProgress:
         """Return the progress of the run for the page."""
         overview = self._overview
         return {
             "phase": "overview" if overview is not None else "again" if self._is_listed else "run",
-            "done": self._done,
+            "done": self._job.done,
             "total": self.again.total if overview is None else overview.total,
             "over": self.over,
-            "error": self._error,
+            "error": self._job.error,
             "warnings": list(self.again.warnings) if self.over else [],
         }
 
-    def _run(self) -> None:
-        try:
-            is_known = self._load_list()
-            first = self.look(self._first)
-            self.first = self._stamp_of(0)
-            explainer = self.explainer(first)
-            self.show(first, find_findings(explainer))
-            self._go.wait(FIRST)
-            self._opened(explainer)
-            if self.again.total >= LEAST and not is_known:
-                self._make_overview()
-            with self.drive.new_session() as session:
-                run(self.again, session, [self], stop=self._stop)
-            if not (self._stop.is_set() or self._is_listed):
-                self.findings.end_overview(self.scans)
-                self._save_list()
-        except Exception as error:
-            self._error = (
-                str(error) if isinstance(error, UserError) else f"the run failed: {first_line(error)}"
-            )
-        self.over = True
-        self.news.tell()
+    def _run(self, job: Job) -> None:
+        is_known = self._load_list()
+        first = self.look(self._first)
+        self.first = self._stamp_of(0)
+        explainer = self.explainer(first)
+        self.show(first, find_findings(explainer))
+        self._go.wait(FIRST)
+        self._opened(explainer)
+        if self.again.total >= LEAST and not is_known:
+            self._make_overview()
+        with self.drive.new_session() as session:
+            run(self.again, session, [self], stop=job.stop)
+        if not (job.stop.is_set() or self._is_listed):
+            self.findings.end_overview(self.scans)
+            self._save_list()
 
     def _load_list(self) -> bool:
         """List the findings of an earlier run. Return whether they are kept.
@@ -185,8 +182,8 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         """List the findings of single frames all over the drive."""
         self._overview = NumberedFrames(self.again, overview_order(len(self.again.scans)))
         processor = SingleFrames(self.drive.session)
-        run(self._overview, processor, [self], stop=self._stop)
-        self._overview, self._done = None, 0
+        run(self._overview, processor, [self], stop=self._job.stop)
+        self._overview, self._job.done = None, 0
 
     def _observe_single(self, result: FrameResult) -> None:
         """List the findings of a frame of the overview. Then wait while a question is being answered.
@@ -197,7 +194,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         frame = result.frame
         self.findings.add_overview(frame.index, find_findings(self.explainer(result), restore=False))
         self._picture(frame)
-        self._done += 1
+        self._job.done += 1
         self.news.tell()
         self.wait_for_quiet()
 
@@ -223,7 +220,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
         if not self._is_listed:
             self.findings.end_overview(frame.index)
             self.findings.add(findings)
-        self._done += 1
+        self._job.done += 1
         self.news.tell()
         self.wait_for_quiet()
 
