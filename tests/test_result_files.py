@@ -227,7 +227,7 @@ def test_results_of_another_drive_are_told(tmp_path: Path) -> None:
         (
             "detector.model",
             "frame,name,x0,y0,x1,y1\n1,Car,5,6,50,60\n1,Car,9,9,3,3\n",
-            "its corners are [9.0, 9.0, 3.0, 3.0]",
+            "its size is negative: -6, -6, 0",
         ),
     ],
 )

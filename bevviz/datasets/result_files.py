@@ -17,7 +17,7 @@ import numpy as np
 from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, describe_error, files_in
 from bevviz.datasets.kitti_labels import TURN, Calibration, labelled_boxes
 from bevviz.errors import UserError, first_line
-from bevviz.messages.foreign_boxes import BoxRow, box_columns, box_name, boxes_3d, check_box_count
+from bevviz.messages.foreign_boxes import BoxRow, box_columns, boxes_2d, boxes_3d
 from bevviz.messages.topics import Topic
 from bevviz.model import geometry
 from bevviz.model.class_names import NUSCENES_CLASSES
@@ -84,17 +84,16 @@ class ResultFile(ABC):
         self, frame: Frame, xyxy: Any, labels: Sequence[str], scores: Any, camera: str
     ) -> LabelledBoxes2D:
         """Return boxes in the image of a camera. Raise ValueError if there are too many."""
-        check_box_count(len(labels))
-        corners = np.asarray(xyxy, np.float32).reshape(-1, 4)
-        usable = np.isfinite(corners).all(axis=1) & (corners[:, 2:] > corners[:, :2]).all(axis=1)
-        unusable = tuple(
-            f"{box_name(row, labels[row], '')}: its corners are {corners[row].tolist()}"
-            for row in np.flatnonzero(~usable).tolist()
-        )
-        kept = tuple(labels[row] for row in np.flatnonzero(usable).tolist())
-        values = np.asarray(scores, np.float32)[usable]
-        about = self.topic, frame.stamp, ""
-        return LabelledBoxes2D(*about, corners[usable], kept, values, camera, frame.received, unusable)
+        corners = np.asarray(xyxy, np.float64).reshape(-1, 4)
+        low, high, zero = corners[:, :2], corners[:, 2:], np.zeros((len(corners), 1))
+        numbers = np.hstack([(low + high) / 2, zero, high - low, zero])
+        columns = box_columns(_box_rows(numbers, labels, scores), 6)
+        boxes = boxes_2d(columns, self.topic, frame.received, frame.stamp, "")
+        return replace(boxes, scores=np.asarray(scores, np.float32)[columns.usable], camera=camera)
+
+
+def _box_rows(numbers: F64, labels: Sequence[str], scores: Any) -> list[BoxRow]:
+    return [BoxRow(*row) for row in zip(map(tuple, numbers.tolist()), labels, scores, strict=True)]
 
 
 def open_results(
@@ -122,9 +121,10 @@ def open_results(
         path = Path(text).expanduser()
         file = _open(name, path, drive, scans, samples)
         if not file.frames:
-            raise UserError(
-                f"--results {path}: no result in it is of one of the {scans} frames of this drive"
-            )
+            lost = f"no result in it is of one of the {scans} frames of this drive"
+            if isinstance(file, NuScenesResults) and not samples:
+                lost = "its results are of nuScenes' samples, which the drive lacks"
+            raise UserError(f"--results {path}: {lost}")
         last = max(file.numbers, default=0)
         if last == scans and 0 not in file.numbers:
             raise UserError(
@@ -138,14 +138,7 @@ def open_results(
 
 def results_are_2d(path: Path) -> bool:
     """Tell whether a file has image boxes alone. The drive is not needed for that."""
-    return _open("", path, Path(), 1 << 40, _AnySample()).is_2d
-
-
-class _AnySample(dict[str, int]):
-    """Stamps of samples where the drive is not open."""
-
-    def __contains__(self, token: object) -> bool:
-        return True
+    return _open("", path, Path(), 1 << 40, {}).is_2d
 
 
 def _open(name: str, path: Path, drive: Path, scans: int, samples: Mapping[str, int]) -> ResultFile:
@@ -258,8 +251,6 @@ class NuScenesResults(ResultFile):
     def __init__(self, name: str, path: Path, results: Mapping[str, Any], samples: Mapping[str, int]) -> None:
         super().__init__(name, path)
         self._by_stamp = {samples.get(token, 0): rows for token, rows in results.items() if token in samples}
-        if not samples and not isinstance(samples, _AnySample):
-            raise UserError(f"--results {path}: its results are of nuScenes' samples, which the drive lacks")
         self.frames = range(len(self._by_stamp))
 
     def of(self, frame: Frame) -> Labelled | None:
@@ -367,7 +358,7 @@ class TableResults(ResultFile):
         if not self.is_2d:
             half = box[:, 6:] / 2
             numbers = np.hstack([box[:, :6], np.zeros((len(box), 2)), np.sin(half), np.cos(half)])
-            return self.placed(frame, list(map(BoxRow, map(tuple, numbers.tolist()), labels, scores)))
+            return self.placed(frame, _box_rows(numbers, labels, scores))
         names = [str(name) for name in values.get("camera", ())]
         camera = names[0] if names else next((camera.name for camera in frame.cameras), "")
         return self.in_image(frame, box, labels, scores, camera)

@@ -11,6 +11,7 @@ import numpy as np
 
 from bevviz.datasets.dataset import Stream
 from bevviz.datasets.ground_truth import truth_boxes, truth_stream
+from bevviz.datasets.kitti_labels import TURN
 from bevviz.errors import UserError
 from bevviz.model.frame import I64, Boxes3D, LabelledBoxes3D
 from bevviz.support.files import read_text
@@ -59,7 +60,7 @@ def read_labels(file: Path) -> LabelledBoxes3D:
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise UserError(f"{file}: no boxes with psr and obj_type: {error!r}") from None
     largest = np.abs(array[:, 2]).max(initial=0)
-    if largest > 2 * np.pi:
+    if largest > TURN:
         raise UserError(f"{file}: a rotation of {largest:.0f} is no angle in radians: is it in degrees?")
     boxes = Boxes3D(
         array[:, 0].astype(np.float32), array[:, 1].astype(np.float32), array[:, 2, 2].astype(np.float32)

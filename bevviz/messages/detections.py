@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bevviz.messages.decoders import either, frame_name, stamp_ns
-from bevviz.messages.foreign_boxes import BoxRow, box_columns, boxes_3d, decode_objects
+from bevviz.messages.foreign_boxes import BoxRow, box_columns, boxes_2d, boxes_3d, decode_objects
 from bevviz.messages.poses import quaternion_of, vector_of
 from bevviz.model.frame import Bool, ImageLabels, LabelledBoxes2D, LabelledBoxes3D
 
@@ -28,19 +28,8 @@ def decode_detections_2d(msg: Any, topic: str, received: int) -> LabelledBoxes2D
         return position.x, position.y, center.theta, box.size_x, box.size_y, 0.0
 
     columns = box_columns(_rows(msg, numbers), 6)
-    x, y, theta, w, h, _ = columns.values.T
-    cos, sin = np.abs(np.cos(theta)), np.abs(np.sin(theta))
-    dx, dy = (w * cos + h * sin) / 2, (w * sin + h * cos) / 2
-    return LabelledBoxes2D(
-        topic=topic,
-        stamp=stamp_ns(msg.header.stamp),
-        frame_id=frame_name(msg.header.frame_id) or next(iter(columns.frames), ""),
-        xyxy=np.stack([x - dx, y - dy, x + dx, y + dy], axis=1).astype(np.float32),
-        labels=columns.labels,
-        scores=columns.scores,
-        received=received,
-        unusable=columns.unusable,
-    )
+    frame_id = frame_name(msg.header.frame_id) or next(iter(columns.frames), "")
+    return boxes_2d(columns, topic, received, stamp_ns(msg.header.stamp), frame_id)
 
 
 def decode_boxes(msg: Any, topic: str, received: int, stated: Mapping[str, str]) -> LabelledBoxes3D:

@@ -15,7 +15,7 @@ from bevviz.errors import UserError
 from bevviz.messages.decoders import frame_name, stamp_ns
 from bevviz.messages.guard import describe_kind, field_names
 from bevviz.messages.poses import UPRIGHT, quaternion_of, vector_of, yaw_of
-from bevviz.model.frame import F32, F64, Bool, Boxes3D, LabelledBoxes3D
+from bevviz.model.frame import F32, F64, Bool, Boxes3D, LabelledBoxes2D, LabelledBoxes3D
 from bevviz.support.limits import MAX_BOXES
 
 T = TypeVar("T")
@@ -275,6 +275,19 @@ def boxes_3d(columns: BoxColumns, topic: str, received: int, stamp: int, frame_i
         ids=columns.ids if all(columns.ids) else (),
         turns=turns,
         frames=columns.frames if len(set(columns.frames)) > 1 else (),
+        unusable=columns.unusable,
+    )
+
+
+def boxes_2d(columns: BoxColumns, topic: str, received: int, stamp: int, frame_id: str) -> LabelledBoxes2D:
+    """Make the result of columns of image boxes. A rotated box becomes the upright box around it."""
+    x, y, theta, w, h, _ = columns.values.T
+    cos, sin = np.abs(np.cos(theta)), np.abs(np.sin(theta))
+    dx, dy = (w * cos + h * sin) / 2, (w * sin + h * cos) / 2
+    xyxy = np.stack([x - dx, y - dy, x + dx, y + dy], axis=1).astype(np.float32)
+    return LabelledBoxes2D(
+        *(topic, stamp, frame_id, xyxy, columns.labels, columns.scores),
+        received=received,
         unusable=columns.unusable,
     )
 
