@@ -134,11 +134,12 @@ class FrameExplainer:
         answers = [a for a in self.ask(Selection()) if a.near and not a.verdict.reported]
         return sorted(answers, key=_sort_distance)
 
-    def with_hints(self, answer: Answer) -> Answer:
-        """Add hints and a remark to an answer. Its sentence then names the first hint, or what was tried.
+    def search(self, answer: Answer) -> Answer:
+        """Search changes that would change the verdict. This runs other configurations and takes a while."""
+        return HintFinder(self.traces, self._runs, self._neighbours, answer).search()
 
-        This runs other configurations and takes a while.
-        """
+    def with_hints(self, answer: Answer) -> Answer:
+        """Add hints and a remark to an answer. Its sentence then names the first hint, or what was tried."""
         if answer.empty:
             return answer
         if answer.label >= 0 and (labelled := self._labelled) is not None:
@@ -149,8 +150,7 @@ class FrameExplainer:
         if answer.verdict.kind is ReasonKind.SECOND_NAME:
             remark = untried_text(answer.subject, answer.verdict)
             return replace(answer, remark=f"{remark[0].upper()}{remark[1:]}.")
-        answer = self.with_restoring_stages(answer)
-        answer = HintFinder(self.traces, self._runs, self._neighbours, answer).search()
+        answer = self.search(self.with_restoring_stages(answer))
         verdict = answer.verdict
         if answer.hints:
             hint = answer.hints[0]
