@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Set
 
 import numpy as np
 import rerun as rr
@@ -30,7 +30,7 @@ from bevviz.recording.states import StateLanes
 from bevviz.recording.writer import Writer
 from bevviz.support import table
 from bevviz.support.colors import SIDE_COLORS, StateColor
-from bevviz.support.text import markdown
+from bevviz.support.text import markdown, section
 
 COLORS = {
     Change.SAME: SIDE_COLORS["same"],
@@ -196,20 +196,15 @@ def differences_page(differences: FrameDifferences) -> str:
     head, effects = f"### Frame {differences.a.index}", differences.effects
     lines = [head, "", table.markdown([("", "A", "B"), *_totals(differences)])]
     for title, objects in (("Broken by B", effects.broken), ("Fixed by B", effects.fixed)):
-        lines += _section(f"{title}: {len(objects)}", [markdown(effects.label_text(row)) for row in objects])
+        lines += section(f"{title}: {len(objects)}", [markdown(effects.label_text(row)) for row in objects])
     for change in (*DIFFERENT, Change.SAME):
         selected = [d for d in differences.objects if d.change is change]
         title = f"{change[0].upper()}{change[1:]}: {len(selected)}"
-        lines += _section(title, [f"{markdown(_item(d))} {differences.position_of(d)}" for d in selected])
+        lines += section(title, [f"{markdown(_item(d))} {differences.position_of(d)}" for d in selected])
     for camera, pairs in differences.images.items():
         texts = [markdown(d.text) for d in pairs if d.change is not Change.SAME]
-        lines += _section(f"Detections, {markdown(camera)}", texts)
+        lines += section(f"Detections, {markdown(camera)}", texts)
     return "\n".join(lines)
-
-
-def _section(title: str, items: Sequence[str]) -> list[str]:
-    """Return the lines of a heading and a list. Without items, there is none."""
-    return ["", f"#### {title}", "", *(f"- {item}" for item in items)] if items else []
 
 
 def _totals(differences: FrameDifferences) -> Iterator[tuple[str, str, str]]:

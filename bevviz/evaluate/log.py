@@ -18,7 +18,7 @@ from bevviz.recording.layers import Layer, Style, callouts, draw
 from bevviz.recording.primitives import document, transform
 from bevviz.recording.writer import SCALAR_WAIT, Writer
 from bevviz.support.colors import TRUTH_COLORS
-from bevviz.support.text import markdown
+from bevviz.support.text import markdown, section
 
 _WRONG = ("missed", "false")  # outcomes whose objects have marks
 
@@ -96,7 +96,5 @@ def _cause(causes: Mapping[int, Reason], row: int) -> str:
 def _page(index: int, truth: Truth, texts_by_outcome: dict[str, Sequence[str]]) -> str:
     lines = [f"### Frame {index}", "", f"{int(truth.must.sum())} objects had to be found"]
     for outcome, texts in texts_by_outcome.items():
-        if texts:
-            lines += ["", f"#### {outcome[0].upper()}{outcome[1:]}: {len(texts)}", ""]
-            lines += [f"- {markdown(text)}" for text in texts]
+        lines += section(f"{outcome.capitalize()}: {len(texts)}", [*map(markdown, texts)])
     return "\n".join(lines)

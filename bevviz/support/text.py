@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from reprlib import Repr
 
@@ -59,6 +59,11 @@ def fenced(text: str, language: str = "") -> str:
     runs = re.findall(r"`{3,}", text)
     fence = "`" * (max(map(len, runs), default=2) + 1)
     return f"{fence}{language}\n{text.removesuffix(chr(10))}\n{fence}"
+
+
+def section(title: str, items: Sequence[str]) -> list[str]:
+    """Return the Markdown lines of a heading and a list. Without items, there is none."""
+    return ["", f"#### {title}", "", *(f"- {item}" for item in items)] if items else []
 
 
 def did_you_mean(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:

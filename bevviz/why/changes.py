@@ -207,12 +207,11 @@ def _our_changes(
             yield {"clustering.min_points": points}
             if points < clustering.min_cluster_points:
                 yield {"clustering.min_points": points, "clustering.min_cluster_points": points}
-        for factor in (1.5, 2.0):
-            yield {"clustering.eps": round(clustering.eps * factor, 3)}
+        yield from _scaled(config, "clustering.eps", 1.5, 2.0)
         yield from _ground_changes(config)
     elif kind is ReasonKind.TOO_SMALL:
         yield {"clustering.min_cluster_points": max(count, 1)}
-        yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
+        yield from _scaled(config, "clustering.eps", 1.5)
     elif kind is ReasonKind.TOO_LARGE:
         yield {"clustering.max_cluster_points": count}
     elif is_false and named is not None and result.objects is not None:
@@ -221,19 +220,19 @@ def _our_changes(
         yield from _regrouped(config, 0.8, 1.5)
     elif kind is ReasonKind.MERGED:
         if evidence.joined_by is not None:
-            yield {"fusion.min_rating": round(2 * config.fusion.min_rating, 4)}
+            yield from _scaled(config, "fusion.min_rating", 2.0)
             yield {"fusion.split": False}
         if config.fusion.method == "frustum" and not config.fusion.split:
             yield {"fusion.split": True}
         if evidence.finer:
             yield from ({"clustering.eps": round(evidence.finer * factor, 3)} for factor in (1.0, 0.85, 0.7))
         elif not evidence.others:
-            yield from ({"clustering.eps": round(clustering.eps * factor, 3)} for factor in (0.8, 0.6, 0.4))
+            yield from _scaled(config, "clustering.eps", 0.8, 0.6, 0.4)
     elif kind is ReasonKind.SPLIT:
         # The distance is unknown if one of the parts is not a cluster.
         yield {"clustering.eps": round(max(np.nan_to_num(evidence.apart), clustering.eps) * 1.1, 3)}
         yield {"clustering.min_points": max(1, clustering.min_points // 2)}
-        yield {"clustering.eps": round(clustering.eps * 1.5, 3)}
+        yield from _scaled(config, "clustering.eps", 1.5)
     elif best is not None:
         yield from _detection_changes(kind, best, config)
 
@@ -261,16 +260,16 @@ def _restored_values(kind: ReasonKind, config: Config) -> Iterator[Change]:
 
 def _changes_against_false(kind: ReasonKind, score: float, config: Config) -> Iterator[Change]:
     """Yield changes that may remove a false object: those for its cause, then stricter limits."""
-    fusion, detector = config.fusion, config.detector
+    method = config.fusion.method
     if kind is ReasonKind.DUPLICATE:
-        yield from ({"detector.iou_threshold": round(f * detector.iou_threshold, 3)} for f in (0.8, 0.6))
+        yield from _scaled(config, "detector.iou_threshold", 0.8, 0.6)
     if kind in (ReasonKind.DUPLICATE, ReasonKind.SPLIT):
         yield from _regrouped(config, 1.5)
     elif kind is not ReasonKind.DETECTOR_ERROR:
         yield from _regrouped(config, 0.8, 1.5)
-    if fusion.method == "frustum":
-        yield from ({"fusion.min_rating": round(fusion.min_rating * factor, 4)} for factor in (2, 4))
-        yield from ({"fusion.min_iou": round(fusion.min_iou * factor, 3)} for factor in (2, 3))
+    if method == "frustum":
+        yield from _scaled(config, "fusion.min_rating", 2.0, 4.0)
+        yield from _scaled(config, "fusion.min_iou", 2.0, 3.0)
     elif kind in (ReasonKind.WALL, ReasonKind.WRONG_DEPTH, ReasonKind.DUPLICATE):
         yield {"fusion.method": "frustum"}
     if score < 0.6:  # A higher threshold would lose too many right objects.
@@ -281,7 +280,13 @@ def _regrouped(config: Config, *factors: float) -> Iterator[Change]:
     """Yield changes that group the points in another way: by the detections, or by another eps."""
     if config.fusion.method == "frustum":
         yield {"fusion.split": not config.fusion.split}
-    yield from ({"clustering.eps": round(config.clustering.eps * factor, 3)} for factor in factors)
+    yield from _scaled(config, "clustering.eps", *factors)
+
+
+def _scaled(config: Config, key: str, *factors: float) -> Iterator[Change]:
+    """Yield a number times some factors. A rating is small, and keeps four decimals."""
+    present, decimals = values(config)[key], 4 if key == "fusion.min_rating" else 3
+    yield from ({key: round(present * factor, decimals)} for factor in factors)
 
 
 def _detection_changes(kind: ReasonKind, best: Candidate, config: Config) -> Iterator[Change]:
@@ -300,14 +305,10 @@ def _detection_changes(kind: ReasonKind, best: Candidate, config: Config) -> Ite
     elif kind is ReasonKind.SUPPRESSED:
         yield from ({"detector.iou_threshold": value} for value in (0.6, 0.7, 0.8, 0.9))
     elif kind is ReasonKind.LOW_OVERLAP:
-        yield from (
-            {"fusion.min_iou": round(config.fusion.min_iou * factor, 3)} for factor in (0.5, 0.2, 0.0)
-        )
-        yield {"clustering.eps": round(config.clustering.eps * 0.6, 3)}
+        yield from _scaled(config, "fusion.min_iou", 0.5, 0.2, 0.0)
+        yield from _scaled(config, "clustering.eps", 0.6)
     elif kind is ReasonKind.MISFIT:
-        yield from (
-            {"fusion.min_rating": round(config.fusion.min_rating * factor, 4)} for factor in (0.5, 0.2)
-        )
+        yield from _scaled(config, "fusion.min_rating", 0.5, 0.2)
         yield {"fusion.split": False}
     elif kind is ReasonKind.TOO_FEW_POINTS:
         yield from ({"fusion.min_points": value} for value in range(config.fusion.min_points - 1, 0, -1))

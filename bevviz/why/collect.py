@@ -47,8 +47,8 @@ def collect_evidence(subject: Subject, traces: FrameIndex) -> Evidence:
         main = named.cluster
     center = center_of(subject, result, main)
     candidates = sort_candidates(candidates, subject, main, result.config.detector.conf_threshold)
-    mates = find_mates(subject, traces, main, obstacle)
-    shared = separation(subject, traces, main, obstacle, mates)
+    mates = find_mates(subject, traces, main)
+    gap, finer, joined_by = separation(subject, traces, main, mates)
     hiding = traces.cluster[front_rows]
     hiding = hiding[hiding >= 0]
     config = result.config.clustering
@@ -72,9 +72,9 @@ def collect_evidence(subject: Subject, traces: FrameIndex) -> Evidence:
         named=named,
         mates=tuple(other.row for other, _ in mates),
         others=tuple((other.name, count) for other, count in mates),
-        gap=shared[0],
-        finer=shared[1],
-        joined_by=shared[2],
+        gap=gap,
+        finer=finer,
+        joined_by=joined_by,
         apart=_largest_gap(result, parts),
         in_view=bool(candidates) or traces.in_view(subject),
     )

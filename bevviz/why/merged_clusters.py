@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from bevviz.model import geometry
-from bevviz.model.frame import F32, I32, I64, Bool
+from bevviz.model.frame import F32, I32, Bool
 from bevviz.model.reasons import Scored
 from bevviz.stages.clustering import dbscan
 from bevviz.support.numba_kernel import kernel
@@ -19,12 +19,10 @@ FINER = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)  # factors on clustering.eps to
 LOOKED_AT = 2000  # points of a large set used for distances
 
 
-def find_mates(
-    subject: Subject, traces: FrameIndex, main: int, obstacle_rows: I64
-) -> list[tuple[Subject, int]]:
+def find_mates(subject: Subject, traces: FrameIndex, main: int) -> list[tuple[Subject, int]]:
     """Return the other objects in the subject's main cluster, with their numbers of points there."""
-    clusters, obstacles = traces.result.clusters, traces.result.obstacles
-    if main < 0 or clusters is None or obstacles is None:
+    clusters = traces.result.clusters
+    if main < 0 or clusters is None:
         return []
     if subject.kind == "truth":
         rows = traces.mates(main, subject.row)
@@ -32,7 +30,7 @@ def find_mates(
     if subject.kind != "detection":
         return []
     members = np.flatnonzero(clusters.labels == main)
-    mine = _marked(obstacle_rows, len(obstacles))[members]
+    mine = traces.obstacles_of(subject)[members]
     mates = []
     for other in traces.competing:
         if other.key == subject.key or not _same_view(subject, other):
@@ -44,13 +42,6 @@ def find_mates(
     return mates
 
 
-def _marked(rows: I64, total: int) -> Bool:
-    """Return (total,) whether each row is one of these."""
-    is_marked = np.zeros(total, np.bool_)
-    is_marked[rows] = True
-    return is_marked
-
-
 def _same_view(a: Subject, b: Subject) -> bool:
     """Return whether two detections can be two objects of one image, and not one object detected twice."""
     if a.xyxy is None or b.xyxy is None:
@@ -59,7 +50,7 @@ def _same_view(a: Subject, b: Subject) -> bool:
 
 
 def separation(
-    subject: Subject, traces: FrameIndex, main: int, obstacle_rows: I64, mates: Sequence[tuple[Subject, int]]
+    subject: Subject, traces: FrameIndex, main: int, mates: Sequence[tuple[Subject, int]]
 ) -> tuple[float, float, Scored | None]:
     """Return the gap in metres between the subject and its mates, the eps that parts them, and the joiner.
 
@@ -71,7 +62,7 @@ def separation(
     if main < 0 or clusters is None or obstacles is None or subject.kind not in ("truth", "detection"):
         return float("nan"), 0.0, None
     members = np.flatnonzero(clusters.labels == main)
-    mine = _marked(obstacle_rows, len(obstacles))[members]
+    mine = traces.obstacles_of(subject)[members]
     if not mates and (subject.kind == "detection" or mine.mean() >= MOST):
         return float("nan"), 0.0, None
     points = obstacles[members]

@@ -11,7 +11,7 @@ from bevviz.config import BevConfig
 from bevviz.errors import UserError
 from bevviz.model import box_overlap, geometry
 from bevviz.model.class_names import accepted_names
-from bevviz.model.frame import F32, I64, Boxes3D, Intrinsics
+from bevviz.model.frame import F32, I64, Boxes3D
 from bevviz.model.results import CameraResult, DetectionState, Opinion
 from bevviz.support.text import did_you_mean
 from bevviz.why.false_objects import false_reasons
@@ -177,25 +177,21 @@ def _pixel(traces: FrameIndex, selection: Selection) -> Subject:
 
 def _selected_box(camera: CameraResult, selection: Selection) -> F32:
     """Return the (4,) image box in question: the selected box, or the surroundings of the pixel."""
-    size = camera.camera.intrinsics or _image_size(camera)
-    if size is None:
+    intrinsics, image = camera.camera.intrinsics, camera.camera.image
+    if intrinsics is not None:
+        width, height = intrinsics.width, intrinsics.height
+    elif image is not None:
+        height, width = image.bgr.shape[:2]
+    else:
         raise UserError(f"--box: {camera.camera.name} has no image in this frame")
     low, high = np.array(selection.box[:2]), np.array(selection.box[-2:])
-    if (low < -0.5).any() or (high > [size.width - 0.5, size.height - 0.5]).any() or (high < low).any():
+    if (low < -0.5).any() or (high > [width - 0.5, height - 0.5]).any() or (high < low).any():
         raise UserError(
             f"--box {','.join(f'{v:g}' for v in selection.box)}: outside the image of {camera.camera.name}, "
-            f"which has {size.width} x {size.height} pixels"
+            f"which has {width} x {height} pixels"
         )
     around = PIXELS if len(selection.box) == 2 else 0.0
     return np.concatenate([low - around, high + around]).astype(np.float32)
-
-
-def _image_size(camera: CameraResult) -> Intrinsics | None:
-    """Return the size of the camera's image as intrinsics; None without an image."""
-    if camera.camera.image is None:
-        return None
-    height, width = camera.camera.image.bgr.shape[:2]
-    return Intrinsics(width, height, np.eye(3))
 
 
 def camera_of(traces: FrameIndex, name: str) -> CameraResult:

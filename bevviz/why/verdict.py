@@ -10,7 +10,7 @@ import numpy as np
 from bevviz.evaluate import MAX_DISTANCE
 from bevviz.model.decisions import pair_kind
 from bevviz.model.reasons import Reason, ReasonKind, facts_of, kind_of
-from bevviz.model.results import ClusterState, Decision, DetectionState, FrameResult, Fusion, Opinion
+from bevviz.model.results import Decision, DetectionState, FrameResult, Fusion, Opinion
 from bevviz.why.evidence import MOST, Candidate, Evidence, ReportedObject
 from bevviz.why.false_objects import false_reasons
 from bevviz.why.frame_index import FEW, PART, FrameIndex
@@ -116,20 +116,13 @@ def likely_reasons(
 
     Ground truth tells which one mattered, so there are none with it.
     """
-    aside = evidence.aside
-    lost = {
-        ReasonKind.GROUND: ground_lost(subject, evidence),
-        ReasonKind.NOISE: evidence.noise,
-        ReasonKind.TOO_SMALL: evidence.aside_points,
-    }
-    first = kind if aside is None or kind is not ReasonKind.TOO_LARGE else ReasonKind.TOO_SMALL
-    if traces.labels_in_evaluate is not None or subject.is_place or first not in lost or evidence.main >= 0:
+    lost = {ReasonKind.GROUND: ground_lost(subject, evidence), ReasonKind.NOISE: evidence.noise}
+    if (aside := evidence.aside) is not None:
+        lost[kind_of(aside.state)] = evidence.aside_points
+    if traces.labels_in_evaluate is not None or subject.is_place or kind not in lost or evidence.main >= 0:
         return ()
-    second = max((other for other in lost if other is not first), key=lambda other: lost[other])
-    if lost[second] < NEARLY * lost[first]:
-        return ()
-    is_large = aside is not None and aside.state == ClusterState.TOO_LARGE
-    return kind, ReasonKind.TOO_LARGE if is_large and second is ReasonKind.TOO_SMALL else second
+    second = max((other for other in lost if other is not kind), key=lambda other: lost[other])
+    return () if lost[second] < NEARLY * lost[kind] else (kind, second)
 
 
 class _Decider:
