@@ -169,7 +169,7 @@ def test_two_people_are_explained_without_truth() -> None:
     answers = why(blind, Selection(label="person"), CLASSES, hints=0)
     merged = [a for a in answers if a.verdict.kind is ReasonKind.MERGED]
     assert merged and all(a.subject.kind == "detection" for a in merged)
-    assert any(not a.verdict.reported and a.evidence.others for a in merged)
+    assert any(not a.verdict.reported and a.evidence.mates for a in merged)
 
 
 def test_two_losses_without_truth_are_both_named() -> None:

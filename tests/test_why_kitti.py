@@ -118,9 +118,9 @@ def test_noise_and_merged_agree_with_the_clustering_alone(asked: dict[str, Asked
             if kind is ReasonKind.NOISE:
                 assert evidence.noise <= (mine < 0).sum() and evidence.neighbours < config.min_points
                 assert evidence.noise >= max(evidence.aside_points, len(evidence.ground))
-            elif kind is ReasonKind.MERGED and evidence.joined_by is None and evidence.others:
-                others = [index.truth[row] for row in evidence.mates]
-                theirs = [index.obstacle[np.unique(voxels.inverse[index.place(other)])] for other in others]
+            elif kind is ReasonKind.MERGED and evidence.joined_by is None and evidence.mates:
+                places = [index.place(mate) for mate, _ in evidence.mates]
+                theirs = [index.obstacle[np.unique(voxels.inverse[place])] for place in places]
                 shared = [np.intersect1d(mine[mine >= 0], first[rows[rows >= 0]]) for rows in theirs]
                 assert any(len(labels) for labels in shared), (frame.name, answer.verdict.text)
             else:

@@ -226,7 +226,7 @@ def _our_changes(
             yield {"fusion.split": True}
         if evidence.finer:
             yield from ({"clustering.eps": round(evidence.finer * factor, 3)} for factor in (1.0, 0.85, 0.7))
-        elif not evidence.others:
+        elif not evidence.mates:
             yield from _scaled(config, "clustering.eps", 0.8, 0.6, 0.4)
     elif kind is ReasonKind.SPLIT:
         # The distance is unknown if one of the parts is not a cluster.

@@ -106,8 +106,7 @@ class Evidence:
         front: cluster of most of the returns in front, -1: none.
         candidates: its detections, the most significant first.
         named: its reported object; None: none.
-        mates: rows of other objects of the ground truth, or of other detections, in its main cluster.
-        others: names of these mates, with their points.
+        mates: other objects of the ground truth, or other detections, in its main cluster, with their points.
         gap: metres between its points and the nearest mate, or the rest of its cluster; NaN: no mate.
         finer: largest eps that separates them when the points are clustered again; 0: none does.
         joined_by: detection for which the fusion joined them; None: the clustering itself did.
@@ -130,8 +129,7 @@ class Evidence:
     front: int
     candidates: tuple[Candidate, ...]
     named: ReportedObject | None
-    mates: tuple[int, ...]
-    others: tuple[tuple[str, int], ...]
+    mates: tuple[tuple[Subject, int], ...]
     gap: float
     finer: float
     joined_by: Scored | None

@@ -181,7 +181,7 @@ class _ReasonWriter:
         part, clusters = evidence.part(main), self.result.clusters
         assert clusters is not None
         rest = int(clusters.count[main]) - (0 if part is None else part.points)
-        names = " and ".join(name for name, _ in evidence.others)
+        names = " and ".join(mate.name for mate, _ in evidence.mates)
         names = names or f"{count(rest, 'point')} that are not its own"
         text = f"cluster {main} holds {names}, too"
         if not np.isfinite(evidence.gap):

@@ -160,9 +160,8 @@ def _cell_center(config: BevConfig, row: int, column: int) -> tuple[float, float
         raise UserError(
             f"cell {row}, {column}: outside the bird's-eye view, which has {rows} rows and {columns} columns"
         )
-    return config.range_x - (row + 0.5) * config.resolution, config.range_y - (
-        column + 0.5
-    ) * config.resolution
+    x, y = (row + 0.5) * config.resolution, (column + 0.5) * config.resolution
+    return config.range_x - x, config.range_y - y
 
 
 def _pixel(traces: FrameIndex, selection: Selection) -> Subject:

@@ -155,11 +155,14 @@ def _merged_steps(evidence: Evidence, traces: FrameIndex) -> Iterator[Step]:
     """Yield the step about other objects in the cluster of the subject, if there are any."""
     if not np.isfinite(evidence.gap):
         return
-    names = ", ".join(f"{name} ({points} points)" for name, points in evidence.others)
+    names = ", ".join(f"{mate.name} ({points} points)" for mate, points in evidence.mates)
     part, owner = evidence.part(evidence.main), traces.origin("clustering")
     names = names or f"{part.count - part.points if part is not None else 0} points that are not its own"
     text = f"the cluster also holds {names}; gap {evidence.gap:.2f} m"
-    numbers: dict[str, Any] = {"others": [name for name, _ in evidence.others], "gap": round(evidence.gap, 3)}
+    numbers: dict[str, Any] = {
+        "others": [mate.name for mate, _ in evidence.mates],
+        "gap": round(evidence.gap, 3),
+    }
     if owner.ours:
         finer = (
             f"with eps {evidence.finer:g} m they fall apart"

@@ -318,7 +318,8 @@ class _Decider:
         evidence = self.evidence
         if fusion.cluster_decision[evidence.main] != Decision.MATCHED:
             return False
-        return self.traces.owner_of(camera, int(fusion.cluster_detection[evidence.main])) in evidence.mates
+        owner = self.traces.owner_of(camera, int(fusion.cluster_detection[evidence.main]))
+        return any(mate.row == owner for mate, _ in evidence.mates)
 
     def _fragment(self, inside: int) -> ReasonKind | None:
         """Return the stage that took most of an object, None if its cluster holds at least half of it."""
