@@ -27,6 +27,7 @@ from tests.support import kept_drives
 from tests.support.live_sessions import live_bench
 from tests.support.recordings import Recording
 from tests.support.replay import Replay
+from tests.support.waiting import until
 
 pytestmark = pytest.mark.filterwarnings("ignore:RRD file has no footer")
 LIMIT = 500  # points
@@ -138,8 +139,9 @@ def test_pages_get_as_many_frames_as_viewers(results: list[FrameResult]) -> None
     with RunningRobot(live) as bench:
         whole = live.encoder.encode(results[0], live.scene, {}, ())
         for packet in (whole, Packet(b"", False, whole.context, 0.0), whole):
-            bench.recording._take(packet, False)
-        assert bench.recording.since(None)[1] == 2
+            bench.recording.put(packet)
+        until(lambda: bench.recording.since(0)[1] == 2)
+        assert bench.recording.since(0)[0] == 2 * [live.encoder.header + whole.shown]
         live.encoder.close()
 
 

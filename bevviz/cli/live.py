@@ -161,17 +161,12 @@ def _run(
         answer_sigusr1(lambda: notes.warn("there is nothing to save yet")),
     ):
         for companion in companions:
-            companion.join(source.nodes.node, settings, refuse)
+            companion.join(source.nodes.node, settings, lambda: control.save(None))
         if not observe:  # Warm up while waiting for the robot.
             warm_up_stages = partial(warm_up, settings.config, loader)
             threading.Thread(target=warm_up_stages, name="warm up", daemon=True).start()
-        reported_missing = ""
         with suppress(KeyboardInterrupt), interruptible(twice=True) as ended:
-            while not source.wait(1.0):
-                missing = source.missing
-                if missing and missing != reported_missing:
-                    reported_missing = missing
-                    say(f"waiting: {reported_missing}")
+            source.wait_aloud(lambda missing: say(f"waiting: {missing}"))
         if ended.is_set():
             return 1
         return _watch(source, settings, options, outputs, notes, loader, companions, control)

@@ -25,7 +25,7 @@ class Companion(Closable):
         Args:
             node: an rclpy node that another thread spins.
             settings: the configuration of the run, which may be changed.
-            save: raises a UserError with the reason why there is nothing to save yet.
+            save: saves the last seconds and returns the path, or raises a UserError with the reason why not.
 
         Raises:
             UserError: a setting of the node is refused.

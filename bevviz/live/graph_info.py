@@ -55,7 +55,9 @@ def describe(
     # A separate node name, so that the topics of another bevviz are shown too.
     with LiveSource(config, arguments=arguments, name="bevviz_info") as source:
         with suppress(KeyboardInterrupt):
-            _wait(source, patience)
+            source.wait_aloud(
+                lambda missing: progress.say(f"waiting {patience:.0f} s at most: {missing}"), patience
+            )
         watch = source.watch
         before, volume = watch.received.copy(), watch.volume.copy()
         start = time.monotonic()
@@ -85,15 +87,6 @@ def describe(
             missing=tuple(missing),
             warnings=(*map(str, source.problems.all.values()), *source.warnings),
         )
-
-
-def _wait(source: LiveSource, patience: float) -> None:
-    """Wait for the roles of the topics. Tell what is waited for."""
-    end, told = time.monotonic() + patience, ""
-    while not source.wait(max(0.0, min(1.0, end - time.monotonic()))) and time.monotonic() < end:
-        if (missing := source.missing) and missing != told:
-            told = missing
-            progress.say(f"waiting {patience:.0f} s at most: {missing}")
 
 
 def _last_frame(source: LiveSource, seconds: float) -> Frame | None:

@@ -8,11 +8,9 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from statistics import median
 
-from bevviz.config import Config
 from bevviz.live.graph import PublishedTopic, Subscriptions, full_name
-from bevviz.live.inputs import SILENCE, Inputs, TopicWatch
+from bevviz.live.inputs import SILENCE, Inputs
 from bevviz.live.node import Node
-from bevviz.live.problems import CurrentProblems
 from bevviz.messages.topics import CLOUDS, Topic
 from bevviz.model.frame import Frame
 from bevviz.sync.report import why_no_images
@@ -36,28 +34,17 @@ class InputProblems:
     """Checks of the input at each look at the graph. Only the receiving thread may use it.
 
     Args:
-        config: configuration of the run.
         node: the nodes of bevviz.
-        inputs: roles, and what was received.
+        inputs: roles, and what was received. Their problems take the findings.
         subscriptions: subscriptions of the topics with a role.
-        watch: arrivals of the topics.
-        problems: takes the findings.
 
     Attributes:
         apart: topics whose clock is told to be apart from the others. No frame waits for them.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        node: Node,
-        inputs: Inputs,
-        subscriptions: Subscriptions,
-        watch: TopicWatch,
-        problems: CurrentProblems,
-    ) -> None:
-        self._config, self._node, self._inputs, self._subscriptions = config, node, inputs, subscriptions
-        self._watch, self._problems = watch, problems
+    def __init__(self, node: Node, inputs: Inputs, subscriptions: Subscriptions) -> None:
+        self._node, self._inputs, self._subscriptions = node, inputs, subscriptions
+        self._watch, self._problems = inputs.watch, inputs.problems
         self.apart: frozenset[str] = frozenset()
         self._counts: dict[tuple[str, str], tuple[int, float]] = {}  # count, and when it last rose
         self._resets = self._frames = 0  # as of the last look
@@ -254,8 +241,8 @@ class InputProblems:
             lambda name: f"{name}: its stamps are in order again",
             least=LASTING,
         )
-        blind = why_no_images(self._config, self._inputs.roles, report) if complete else []
-        model = self._config.detector.model
+        blind = why_no_images(self._inputs.config, self._inputs.roles, report) if complete else []
+        model = self._inputs.config.detector.model
         self._problems.set(
             "detector", model, blind[0] if blind else "", f"detector.model {model} gets images"
         )

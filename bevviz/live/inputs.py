@@ -137,7 +137,8 @@ class Inputs:
     def __init__(
         self, config: Config, resolve: Callable[[str], str], problems: CurrentProblems, *, results: bool
     ) -> None:
-        self._config, self._resolve, self._problems, self._results = config, resolve, problems, results
+        self.config, self.problems, self.watch = config, problems, TopicWatch(problems)
+        self._resolve, self._results = resolve, results
         self.roles = Roles()
         self.sync = Synchronizer(self.roles, config, lapse=SILENCE)
         self.handlers: dict[str, Handler[LiveMessage]] = {}
@@ -165,12 +166,12 @@ class Inputs:
     @cached_property
     def _source(self) -> SourceConfig:
         """The configuration with the topic names on the graph."""
-        return _renamed(self._config.source, self._resolve)
+        return _renamed(self.config.source, self._resolve)
 
     @cached_property
     def _stages(self) -> dict[str, str]:
         """Topics whose messages replace a stage, by key."""
-        return {key: self._resolve(name) for key, name in stage_topics(self._config).items()}
+        return {key: self._resolve(name) for key, name in stage_topics(self.config).items()}
 
     def misstated(self, topics: Iterable[PublishedTopic]) -> dict[str, str]:
         """Return the stated topics that nobody publishes, or that have another type, with the problem."""
@@ -210,13 +211,13 @@ class Inputs:
         try:
             roles = find_roles(*_without_absent(topics, stated), stages, results=self._results)
         except UserError as error:
-            self._problems.set("roles", "topics", str(error))
+            self.problems.set("roles", "topics", str(error))
             return False
-        self._problems.set("roles", "topics", "", "the topics fit the configuration")
+        self.problems.set("roles", "topics", "", "the topics fit the configuration")
         if replace(roles, notes={}) != replace(self.roles, notes={}):
             self.changed = time.monotonic()
             results = {*roles.robot_detections_2d, *roles.robot_detections_3d} - set(stages.values())
-            former, self.sync = self.sync, Synchronizer(roles, self._config, results, SILENCE)
+            former, self.sync = self.sync, Synchronizer(roles, self.config, results, SILENCE)
             self.sync.take_over(former)
             self.handlers = make_handlers(self.sync, roles, self._decode)
             for name in self._packets.packets & self.handlers.keys():
@@ -271,7 +272,7 @@ class Inputs:
     def _add_metadata(self, message: LiveMessage) -> None:
         text = guard(message, surroundings.decode_mark, message.decode())
         if self._packets.add_metadata(message.topic, text):
-            self._problems.tell(f"the metadata on {message.topic} have changed")
+            self.problems.tell(f"the metadata on {message.topic} have changed")
 
     def _gather(self, handler: Handler[LiveMessage], message: LiveMessage) -> None:
         """Gather packets to scans and pass these on. A scan has the time of receipt of its last packet."""

@@ -41,10 +41,11 @@ class Output(ABC):
     Args:
         name: name in the health of the run.
         queue: most packets that may wait.
+        sparse: take whole packets only, for a viewer that is too slow for all packets.
     """
 
-    def __init__(self, name: str, queue: int) -> None:
-        self.name = name
+    def __init__(self, name: str, queue: int, *, sparse: bool = False) -> None:
+        self.name, self._sparse = name, sparse
         self._packets: NewestQueue[Packet] = NewestQueue(queue)
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -61,7 +62,8 @@ class Output(ABC):
 
     def put(self, packet: Packet) -> None:
         """Queue a packet. It never waits."""
-        self._packets.put(packet)
+        if packet.whole or not self._sparse:
+            self._packets.put(packet)
 
     @abstractmethod
     def close(self) -> None:
@@ -145,16 +147,12 @@ def remote(url: str, application: str, recording_id: str) -> Program:
 
 
 class Viewer(Output):
-    """Output that feeds one program. A late viewer gets the newest whole packet and none of the older ones.
-
-    ``sparse``: send whole packets only, for a viewer that is too slow for all packets.
-    """
+    """Output that feeds one program. A late viewer gets the newest whole packet and none before it."""
 
     def __init__(
         self, program: Program, queue: int, encoder: Encoder, notes: Notes, *, sparse: bool = False
     ) -> None:
-        super().__init__(program.name, queue)
-        self._sparse = sparse
+        super().__init__(program.name, queue, sparse=sparse)
         self._program = program
         self._encoder, self._notes = encoder, notes
         self._lag = 0.0  # seconds, lag of the last packet that was handed over
@@ -175,8 +173,6 @@ class Viewer(Output):
 
     def put(self, packet: Packet) -> None:
         """Queue a packet. Clear the queue first if the viewer is late."""
-        if not packet.whole and self._sparse:
-            return
         if packet.whole and self.lag > LATE:
             self._packets.clear()
         super().put(packet)

@@ -13,8 +13,7 @@ from bevviz.live.files import BagSaver, RecordingSaver, free_names
 from bevviz.live.flight_recorder import FlightRecorder
 from bevviz.live.indexing import Indexer
 from bevviz.live.outputs import BEHIND, LATE, Output, Viewer, remote, server, window
-from bevviz.live.problems import CurrentProblems
-from bevviz.live.raw_recorder import RawRecorder
+from bevviz.live.source_wrappers import RobotFrames
 from bevviz.live.status import Notes
 from bevviz.recording import entities
 from bevviz.support.contexts import Closable
@@ -41,8 +40,7 @@ class RunOutputs(Closable):
         settings: limits of files, buffers and queues.
         encoder: makes the packets.
         notes: takes messages to the user.
-        problems: takes the viewers that are behind.
-        raw: recorder of the messages from which the frames are made.
+        source: source of the frames. Its problems take the viewers that are behind.
 
     Attributes:
         urls: addresses of the viewers in a browser.
@@ -58,10 +56,9 @@ class RunOutputs(Closable):
         settings: ReloadableConfig,
         encoder: Encoder,
         notes: Notes,
-        problems: CurrentProblems,
-        raw: RawRecorder | None,
+        source: RobotFrames,
     ) -> None:
-        self._encoder, self._notes, self._problems = encoder, notes, problems
+        self._encoder, self._notes, self._problems, raw = encoder, notes, source.problems, source.raw
         self._indexer, config = Indexer(), settings.config.live
         self.flight = FlightRecorder(settings, encoder, self._indexer, notes, raw)
         self.urls: list[str] = []

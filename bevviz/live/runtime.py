@@ -97,7 +97,7 @@ class Live:
         self.encoder = Encoder(
             self.config, source.scene, outputs.blueprint, whole, self.against, network=network
         )
-        self.outputs = RunOutputs(outputs, settings, self.encoder, notes, self.problems, source.raw)
+        self.outputs = RunOutputs(outputs, settings, self.encoder, notes, source)
         self.flight = self.outputs.flight
         self.watchers: list[Callable[[FrameResult], None]] = []
         self._triggers = Triggers()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -14,7 +15,7 @@ from bevviz.config import Config
 from bevviz.errors import UserError
 from bevviz.live.graph import PublishedTopic, Subscriptions, published_topics
 from bevviz.live.input_problems import InputProblems
-from bevviz.live.inputs import KINDS, STALL, Inputs, TopicWatch
+from bevviz.live.inputs import KINDS, STALL, Inputs
 from bevviz.live.live_message import LiveMessage
 from bevviz.live.node import Node, add_timer, is_cut_off
 from bevviz.live.problems import CurrentProblems
@@ -71,11 +72,9 @@ class LiveSource(Closable):
         raw: RawRecorder | None = None,
         results: bool = False,
     ) -> None:
-        self.config = config
         self.topics: dict[str, PublishedTopic] = {}  # topics published by other nodes
         self.problems = CurrentProblems(tell or (lambda text: None))
         self.raw = raw
-        self.watch = TopicWatch(self.problems)
         self._known: dict[str, PublishedTopic] = {}  # topics that may have a role, or had one
         self._settled = threading.Event()
         self._complete = False  # whether the scene is known
@@ -89,6 +88,7 @@ class LiveSource(Closable):
 
         self.nodes = Node(arguments, on_end=self.stop, name=name)
         self.inputs = Inputs(config, self.nodes.resolve, self.problems, results=results)
+        self.watch = self.inputs.watch
         for kind in KINDS:  # To import them takes 0.1 s, in which the receiving thread would receive nothing.
             with suppress(UserError):
                 message_type(kind)
@@ -96,9 +96,7 @@ class LiveSource(Closable):
         self._subscriptions = Subscriptions(
             self.nodes, requests, self._locked(self._receive), self._locked(self._count_lost)
         )
-        self._checks = InputProblems(
-            config, self.nodes, self.inputs, self._subscriptions, self.watch, self.problems
-        )
+        self._checks = InputProblems(self.nodes, self.inputs, self._subscriptions)
         self._raw_topics = None if raw is None else RawTopics(self.nodes, raw, requests)
         # Subscribed before it is published, because a mark may be sent once only.
         self._mark = PublishedTopic(self.nodes.resolve(MARK), "std_msgs/msg/String", ())
@@ -137,6 +135,17 @@ class LiveSource(Closable):
         settled = self._settled.wait(timeout)
         self._check()
         return settled and not self._ended
+
+    def wait_aloud(self, tell: Callable[[str], None], timeout: float = math.inf) -> bool:
+        """Wait as ``wait`` does. Tell what is waited for, each time that it changes."""
+        end, told = time.monotonic() + timeout, ""
+        while not (settled := self.wait(max(0.0, min(1.0, end - time.monotonic())))):
+            if time.monotonic() >= end:
+                break
+            if (missing := self.missing) and missing != told:
+                told = missing
+                tell(missing)
+        return settled
 
     @property
     def missing(self) -> str:

@@ -99,9 +99,8 @@ class LiveBuffer(Output):
     """
 
     def __init__(self, live: Live, queue: int) -> None:
-        super().__init__("page", queue)
+        super().__init__("page", queue, sparse=live.config.live.viewer_rate is not None)
         self._encoder = live.encoder
-        self._sparse = live.config.live.viewer_rate is not None
         self._pages: list[LiveReader] = []
         self._missed = 0  # pieces that slow pages have skipped
         self._pieces: deque[_Piece] = deque()
@@ -178,8 +177,6 @@ class LiveBuffer(Output):
         return stream.read() or b""
 
     def _take(self, packet: Packet, fresh: bool) -> bool:
-        if self._sparse and not packet.whole:
-            return True
         self._put(self._encoder.header + packet.shown, packet.context if packet.whole else None)
         return True
 

@@ -36,7 +36,6 @@ class RosNode(Companion):
         """Pass requests to the run, and publish."""
         if self._requests is None:
             return
-        self._requests.save = live.flight.save
         live.followers.append(self._requests.show)
         if self._publishes:
             live.receivers.append(RosTopics(self._node, live.notes.warn))

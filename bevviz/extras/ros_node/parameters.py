@@ -25,9 +25,6 @@ class RosRequests:
         settings: the configuration, which takes the values.
         save: writes the recording of the last seconds and returns its path, or raises a UserError.
 
-    Attributes:
-        save: as above. It may be replaced.
-
     Raises:
         UserError: a value given with ``-p`` is refused.
     """
@@ -38,7 +35,7 @@ class RosRequests:
         settings: ReloadableConfig,
         save: Callable[[], Path] | None = None,
     ) -> None:
-        self._node, self._configuration, self.save = node, settings, save
+        self._node, self._configuration, self._save = node, settings, save
         config = settings.config
         about = parameters(config)
         self._keys = {**{key: key for key in about}, **TUTORIAL_NAMES}  # parameter name -> key
@@ -104,9 +101,9 @@ class RosRequests:
         return SetParametersResult(successful=True)
 
     def _trigger(self, request: Any, response: Any) -> Any:
-        assert self.save is not None
+        assert self._save is not None
         try:
-            response.success, response.message = True, str(self.save())
+            response.success, response.message = True, str(self._save())
         except UserError as error:
             response.success, response.message = False, str(error)
         return response
