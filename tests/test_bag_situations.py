@@ -588,6 +588,22 @@ def test_one_of_two_robots_is_shown_and_the_other_is_offered(
         assert not source.doubts
 
 
+def test_a_robot_may_be_without_a_namespace(tmp_path: Path) -> None:
+    """Their frames have the same names, and the other one is 5 m beside."""
+    other = of_robot("b", frames=False, own_tf=True)
+    for item in other:
+        if item.topic == "/b/tf":
+            item.message.transforms[0].transform.translation.y = 5.0
+    bag = bags.write(tmp_path / "drive", [*bags.small_items(scans=3), *other])
+    for settings, name, y in (([], "", 0), ([f"source.lidar_topics=[/b{bags.CLOUD}]"], "/b", 5)):
+        with BagSource([bag], load(settings=settings)) as source:
+            assert source.roles.lidars == (f"{name}{bags.CLOUD}",)
+            assert [camera.topic for camera in source.roles.cameras] == [f"{name}{bags.IMAGE}"]
+            assert [frame.pose[:2, 3].tolist() for frame in source] == [[x, y] for x in range(3)]
+            said = "the topics are of 2 robots, / and b: / is shown; --set source.lidar_topics="
+            assert any(text.startswith(said) for text in source.doubts) != bool(settings)
+
+
 def test_two_sensor_heads_of_one_robot_are_no_robots(tmp_path: Path) -> None:
     items = [item for name in ("front", "rear") for item in of_robot(name, frames=False, own_tf=False)]
     for item in items:

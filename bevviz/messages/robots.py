@@ -6,20 +6,22 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 
 from bevviz.config import SourceConfig
-from bevviz.messages.topics import CLOUDS, IMAGES, Topic
+from bevviz.messages.topics import CLOUDS, IMAGES, Topic, is_derived
 
 # Name of a robot as people number them. Sensors are named by their place: front, rear_left.
 _ROBOT = re.compile(
     r"(?:agent|vehicle|car|truck|uav|ugv|drone|tb|rover|unit|husky|jackal|\w*bot)[_-]?(?:\d+|[a-z])?$"
 )
 MOST = 3  # robots that are offered
+ROOT = "/"  # name of the robot without a namespace
 
 
 def find_robots(topics: Sequence[Topic]) -> dict[str, list[Topic]]:
     """Return the topics of each robot by namespace; nothing if there is but one.
 
     A namespace is a robot's if it has a LiDAR and a camera, transforms or odometry of its own, and its frames
-    have its name before a slash, or its transforms are its own, or it is named as robots are.
+    have its name before a slash, or its transforms are its own, or it is named as robots are. A robot may be
+    without a namespace if it and another one have LiDAR, camera and transforms each.
     """
     sensors = [t for t in topics if t.count != 0 and t.kind in (*CLOUDS, *IMAGES)]
     paths = [topic.name.strip("/").split("/") for topic in sensors]
@@ -29,6 +31,10 @@ def find_robots(topics: Sequence[Topic]) -> dict[str, list[Topic]]:
     names = dict.fromkeys(path[level] for path in paths if len(path) > level + 1)
     robots = {name: _within(topics, level, name) for name in names}
     robots = {name: own for name, own in robots.items() if _is_robot(name, own)}
+    namespaced = {topic.name for own in robots.values() for topic in own}
+    others = [topic for topic in topics if topic.name not in namespaced]
+    if _is_complete(others) and any(map(_is_complete, robots.values())):
+        robots[ROOT] = others
     return dict(sorted(robots.items())) if len(robots) > 1 else {}
 
 
@@ -45,6 +51,12 @@ def _is_robot(name: str, topics: Sequence[Topic]) -> bool:
     clouds = [topic for topic in topics if topic.kind in CLOUDS]
     prefixed = all(topic.frame_id.strip("/").startswith(f"{name}/") for topic in clouds)
     return prefixed or transforms or bool(_ROBOT.match(name.lower()))
+
+
+def _is_complete(topics: Sequence[Topic]) -> bool:
+    """Return whether topics of a LiDAR, a camera and transforms are there, without results of the sensors."""
+    kinds = {topic.kind.lower() for topic in topics if topic.count != 0 and not is_derived(topic)}
+    return {"pointcloud2", "tfmessage"} <= kinds and not kinds.isdisjoint(map(str.lower, IMAGES))
 
 
 def choose_robot(topics: Sequence[Topic], config: SourceConfig) -> tuple[Mapping[str, str], str]:

@@ -306,6 +306,12 @@ _COLOURLESS = re.compile(r"gray|mono|(?<![a-z])ir(?![a-z])")
 _RECTIFIED = re.compile(r"(?<![a-z])rect")
 
 
+def is_derived(topic: Topic) -> bool:
+    """Return whether the name of a cloud or an image says that it is a result."""
+    pattern = _DERIVED_CLOUD if topic.kind in CLOUDS else _DERIVED_IMAGE
+    return topic.kind in (*CLOUDS, *IMAGES) and pattern.search(topic.name.lower()) is not None
+
+
 def find_images(topics: Sequence[Topic], config: SourceConfig, notes: dict[str, str]) -> list[Topic]:
     """Return one topic of images for each camera, sorted by name. Add the reason for each topic to ``notes``.
 
