@@ -17,6 +17,7 @@ from bevviz.cli import main
 from bevviz.config import load
 from bevviz.datasets.kitti_labels import named_rows
 from bevviz.model import geometry
+from bevviz.model.box_points import inside_each
 from bevviz.model.frame import F32, F64, Boxes3D
 from bevviz.model.input_findings import InputFinding, Remedy
 from bevviz.model.results import Detections, FrameResult
@@ -277,6 +278,9 @@ def test_boxes_that_do_not_fit_the_images_are_named(
     assert any(text in str(finding) for finding in checks.findings if finding.kind == "detector")
 
 
+TOPICS = ("ground truth", "/results/net")
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [
@@ -297,19 +301,31 @@ def test_boxes_that_do_not_fit_the_images_are_named(
 def test_boxes_of_another_convention_are_named(
     results: list[FrameResult], change: Callable[[Boxes3D], Boxes3D], text: str
 ) -> None:
-    """Ground truth, and beside it the same boxes in a result file."""
-    with bevviz.simulate(1) as drive:
-        checks = InputChecks(drive.frames, drive.config)
-        for result in results:
-            truth = result.frame.truth
-            assert truth is not None
-            truth = replace(truth, boxes=change(truth.boxes))
-            boxes = replace(truth, topic="/results/net")
-            frame = replace(result.frame, truth=truth, robot_boxes=(boxes,))
+    """Ground truth, and the same boxes in a result file. Three labels of a frame tell, three results not."""
+    assert results[0].frame.truth is not None
+    boxes = results[0].frame.truth.boxes
+    held = np.array([len(rows) for _, rows in inside_each(results[0].frame.points, boxes)])
+    is_judged = (boxes.size[:, 0] > 1.5 * boxes.size[:, 1]) & (boxes.distance < 17)
+    few = boxes.chosen(np.argsort(-np.where(is_judged, held, 0))[:3])
+    every = [result.frame.truth.boxes for result in results if result.frame.truth is not None]
+    one = few.chosen([0])
+    for chosen, topics in (
+        (every, TOPICS),
+        ([few], TOPICS[:1]),
+        ([few.chosen([0, 1])], ()),
+        ([one, one, one], ()),
+    ):
+        with bevviz.simulate(1) as drive:
+            checks = InputChecks(drive.frames, drive.config)
+        for result, boxes in zip(results, chosen, strict=False):
+            assert result.frame.truth is not None
+            truth = replace(result.frame.truth, boxes=change(boxes))
+            results_file = replace(truth, topic=TOPICS[1])
+            frame = replace(result.frame, truth=truth, robot_boxes=(results_file,))
             checks.observe(replace(result, frame=frame))
-    said = [str(finding) for finding in checks.findings if finding.kind == "truth"]
-    assert [text in sentence for sentence in said] == [True, True]
-    assert said[0].startswith("ground truth: ") and said[1].startswith("/results/net: ")
+        said = [str(finding) for finding in checks.findings if finding.kind == "truth"]
+        assert [text in sentence for sentence in said] == [True] * len(topics)
+        assert tuple(sentence.partition(": ")[0] for sentence in said) == topics
 
 
 @pytest.mark.long

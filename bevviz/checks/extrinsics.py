@@ -30,7 +30,8 @@ POOR, GOOD, CLEAR = (
     0.8,
 )  # shares with points: of a wrong pose, a better and a right one
 FAR = 10.0  # metres from the LiDAR, from which on a camera is not on the same robot
-UNITS = (1000, 100, 10)  # divisors of a translation in another unit than metres
+UNITS = {1000: "millimetres", 100: "centimetres", 10: "decimetres"}  # divisors that make metres of a unit
+NEAR = 3.0  # metres; a camera is mostly nearer to the LiDAR
 USUAL = 0.3  # metres between a camera and a LiDAR
 
 # Optical axes (RDF) from body axes (FLU).
@@ -154,7 +155,10 @@ def candidates(stated: F64, others: dict[str, F64]) -> Iterator[tuple[str, F64]]
         for divisor in sorted(UNITS, key=lambda unit: abs(math.log(max(distance, 1e-6) / unit / USUAL))):
             scaled = pose.copy()
             scaled[:3, 3] /= divisor
-            yield f"{what}the translation divided by {divisor} (millimetres or another unit)", scaled
+            unit = UNITS[divisor]
+            if divisor == 1000 and distance < 100 * NEAR:
+                unit += ", or by 100 if it is in centimetres"
+            yield f"{what}the translation divided by {divisor} ({unit})", scaled
     for degrees in (90, -90, 180):
         about_up = np.eye(4)
         about_up[:3, :3] = geometry.rotations(2, np.radians([degrees]))[0]

@@ -16,9 +16,10 @@ from bevviz.model.frame import F64, Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.input_findings import InputFinding, Remedy
 from bevviz.stages.robot_results import in_points_frame
 
+TRUTH = "ground truth"
 NEAR = 20.0  # metres; a LiDAR has points on most labelled objects that are nearer
 FOOT = 0.25  # lowest share of a box, which holds points of the ground wherever it is
-ENOUGH, MOST = 10, 300  # fewest and most boxes that are judged
+FEW, ENOUGH, MOST = 3, 10, 300  # fewest labels that tell if all are odd, fewest boxes that tell, most
 SHARE = 2 / 3  # share of odd boxes; of sound labels those of hidden objects have no points
 POINTS = 10  # fewest points that tell how a box fits
 ABOVE = 0.3  # share of the points of an object that are above a box with z at its bottom; 0.4 are usual
@@ -52,14 +53,16 @@ def wrong_labels(read: ReadInput) -> Iterator[InputFinding]:
     """Yield topics most of whose near boxes do not fit the points, as in another convention."""
     for (source, labels), (of, odd, what, remedy) in itertools.product(read.labels.items(), _ODD):
         total, count = labels[of], labels[odd]
-        if total >= ENOUGH and count > SHARE * total:
+        # One odd object that is labelled in several frames tells nothing.
+        is_few = source == TRUTH and labels["at once"] >= FEW and count == total >= FEW
+        if is_few or (total >= ENOUGH and count > SHARE * total):
             yield InputFinding("truth", source, f"{source}: {count} of {total} {what}", Remedy(remedy))
 
 
 def count_labels(labels: dict[str, Counter[str]], frame: Frame) -> None:
     """Count the near boxes of ground truth and of result files in a frame, and those that are odd."""
     if frame.truth is not None:
-        _count_boxes(labels["ground truth"], frame, frame.truth)
+        _count_boxes(labels[TRUTH], frame, frame.truth)
     for boxes in frame.robot_boxes:
         if boxes.topic.startswith(RESULTS):
             _count_boxes(labels[boxes.topic], frame, boxes)
@@ -77,6 +80,7 @@ def _count_boxes(labels: Counter[str], frame: Frame, labelled: LabelledBoxes3D) 
     is_long = boxes.size[:, :2].max(axis=1, initial=0) > LONG * boxes.size[:, :2].min(axis=1, initial=np.inf)
     is_long &= inside + across >= POINTS
     labels["near"] += len(boxes)
+    labels["at once"] = max(labels["at once"], len(boxes))
     labels["empty"] += int((inside == 0).sum())
     labels["filled"] += int(filled.sum())
     labels["low"] += int((filled & (above > ABOVE * (inside + above))).sum())
