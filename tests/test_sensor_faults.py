@@ -225,6 +225,30 @@ def test_flipped_image_is_told(drive: Results, flip: int, name: str) -> None:
     assert [(fault.sensor, fault.name) for fault in faults_now] == [(CAMERA, name)]
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("is_removed", [True, False])
+def test_distortion_that_was_removed_before_is_told(drive: Results, is_removed: bool) -> None:
+    """The images of KITTI are rectified. These are stated with the coefficients of its raw images."""
+    D = np.array([-0.3728755, 0.2037299, 0.002219027, 0.001383707, -0.07233722])
+    faults_now = []
+    with ThreadPoolExecutor(1) as worker:
+        watch = PlacementWatch(worker)
+        for result in (*drive[:-4], drive[-1]):
+            (camera,) = result.frame.cameras
+            assert camera.intrinsics is not None
+            K, bgr = camera.intrinsics.K, pixels(result)
+            if not is_removed:
+                v, u = np.mgrid[: bgr.shape[0], : bgr.shape[1]].astype(np.float32)
+                raw = np.stack([u, v], -1).reshape(-1, 1, 2)
+                at = cv2.undistortPoints(raw, K, D, P=K).reshape(*bgr.shape[:2], 2)
+                bgr = np.asarray(cv2.remap(bgr, at, np.zeros(0), cv2.INTER_LINEAR), np.uint8)
+            stated = replace(camera.intrinsics, distortion_model="plumb_bob", D=D)
+            frame = with_image(result, bgr).frame
+            frame = replace(frame, cameras=(replace(frame.cameras[0], intrinsics=stated),))
+            faults_now = list(watch.update(frame, frame.clouds, ()))
+    assert [fault.name for fault in faults_now] == ["distortion is corrected twice"] * is_removed
+
+
 def restamped(results: Results) -> Results:
     """Return the results at 10 Hz."""
     moved = []

@@ -3,7 +3,8 @@
 Where the range jumps between neighbouring beams, the image should have an edge (Levinson and Thrun 2013). The
 edges of single frames are scored at the stated mounting and at small rotations around it. A rotation that
 beats the stated mounting clearly, over several frames, is the error of the transform. The image turned by 180
-degrees and its mirror image are scored too: a driver may turn an image where the transform does not.
+degrees and its mirror image are scored too: a driver may turn an image where the transform does not. The same
+holds for the image with its distortion: a driver may have removed it, and still state the coefficients.
 """
 
 from __future__ import annotations
@@ -58,16 +59,17 @@ def _rotations() -> tuple[F64, F64]:
 TURNS, MATRICES = _rotations()
 ROTATIONS = len(TURNS)
 _STATED = np.flatnonzero(np.linalg.norm(TURNS, axis=1) < 1.5 * STEP)
-# Rows of the scores by the code of cv2.flip (None: the image as it is). Flipped images have the rotations
-# at the stated mounting alone. In ``TURNS`` 180 degrees about z are an image upside down, about y a mirror
-# image.
+# Rows of the scores by the code of cv2.flip (None: the image as it is), and of the image with its distortion.
+# These have the rotations at the stated mounting alone. In ``TURNS`` 180 degrees about z are an image upside
+# down, about y a mirror image, and 360 degrees about x an image with its distortion.
 FLIPS = {
     None: slice(ROTATIONS),
     -1: slice(ROTATIONS, ROTATIONS + len(_STATED)),
-    1: slice(ROTATIONS + len(_STATED), None),
+    1: slice(ROTATIONS + len(_STATED), ROTATIONS + 2 * len(_STATED)),
 }
-TURNS = np.concatenate([TURNS, TURNS[_STATED] + [0, 0, 180], TURNS[_STATED] + [0, 180, 0]])
-MATRICES = np.concatenate([MATRICES, MATRICES[_STATED], MATRICES[_STATED]])
+DISTORTED = slice(ROTATIONS + 2 * len(_STATED), None)
+TURNS = np.concatenate([TURNS, *(TURNS[_STATED] + t for t in ([0, 0, 180], [0, 180, 0], [360, 0, 0]))])
+MATRICES = np.concatenate([MATRICES, *[MATRICES[_STATED]] * 3])
 AT_STATED: Bool = np.linalg.norm(TURNS, axis=1) < 1.5 * STEP
 
 
@@ -136,6 +138,12 @@ class PlacementWatch:
         if best < ROTATIONS:
             name = "not where its transform says"
             detail = f", by about {np.linalg.norm(TURNS[best]):.0f} degrees against LiDAR {lidar}"
+        elif TURNS[best, 0] > 180:
+            name = "distortion is corrected twice"
+            detail = (
+                f": without the coefficients of its CameraInfo it fits LiDAR {lidar}; "
+                "--set source.rectified=yes takes it as it is"
+            )
         elif TURNS[best, 2] > 90:
             name = "image upside down"
             detail = f": turned by 180 degrees it fits LiDAR {lidar}; turn the image, or roll its transform"
@@ -187,11 +195,19 @@ def score_rotations(camera: Camera, cloud: Cloud, points_from_cloud: F64) -> F64
     scores = np.zeros(len(TURNS))
     from_camera = (K @ MATRICES).astype(np.float32)
     xyz = geometry.apply(camera_from_cloud, xyz)
-    for flip, rows in FLIPS.items():
-        edges = image_edges(image if flip is None else np.asarray(cv2.flip(image, flip), np.uint8))
+    shown = [
+        (image if flip is None else np.asarray(cv2.flip(image, flip), np.uint8), rows)
+        for flip, rows in FLIPS.items()
+    ]
+    if image is not small:
+        shown.append((small, DISTORTED))
+    for picture, rows in shown:
+        edges = image_edges(picture)
         density, row, _ = densities(change, edges, float(K[0, 0]) * BLUR)
         shift = np.zeros(3, np.float32)
         add_scores(xyz, row, log_densities(density), from_camera[rows], shift, scores[rows])
+    if image is small:
+        scores[DISTORTED] = scores[_STATED]
     return scores
 
 
