@@ -594,6 +594,9 @@ def test_camera_info_of_both_ros_versions(ros: str) -> None:
     rectified = camera_info.decode_camera_info(msg, rectified=True)
     np.testing.assert_array_equal(rectified.K, [[450, 0, 310], [0, 455, 175], [0, 0, 1]])
     assert not rectified.D.size and not rectified.distortion_model
+    assert rectified.raw is not None and raw.raw is None
+    np.testing.assert_array_equal(rectified.raw.D, raw.D)
+    np.testing.assert_array_equal(rectified.raw.K, raw.K)
 
 
 def test_a_rectified_camera_without_p_keeps_k() -> None:

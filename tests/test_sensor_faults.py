@@ -226,9 +226,19 @@ def test_flipped_image_is_told(drive: Results, flip: int, name: str) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("is_removed", [True, False])
-def test_distortion_that_was_removed_before_is_told(drive: Results, is_removed: bool) -> None:
-    """The images of KITTI are rectified. These are stated with the coefficients of its raw images."""
+@pytest.mark.parametrize(
+    ("is_raw", "stated_raw", "name"),
+    [
+        (False, True, "distortion is corrected twice"),
+        (True, False, "distortion is not corrected"),
+        (True, True, ""),
+        (False, False, ""),
+    ],
+)
+def test_distortion_that_is_not_the_stated_one_is_told(
+    drive: Results, is_raw: bool, stated_raw: bool, name: str
+) -> None:
+    """The images of KITTI are rectified. The coefficients are those of its raw images."""
     D = np.array([-0.3728755, 0.2037299, 0.002219027, 0.001383707, -0.07233722])
     faults_now = []
     with ThreadPoolExecutor(1) as worker:
@@ -237,16 +247,17 @@ def test_distortion_that_was_removed_before_is_told(drive: Results, is_removed: 
             (camera,) = result.frame.cameras
             assert camera.intrinsics is not None
             K, bgr = camera.intrinsics.K, pixels(result)
-            if not is_removed:
+            if is_raw:
                 v, u = np.mgrid[: bgr.shape[0], : bgr.shape[1]].astype(np.float32)
-                raw = np.stack([u, v], -1).reshape(-1, 1, 2)
-                at = cv2.undistortPoints(raw, K, D, P=K).reshape(*bgr.shape[:2], 2)
-                bgr = np.asarray(cv2.remap(bgr, at, np.zeros(0), cv2.INTER_LINEAR), np.uint8)
-            stated = replace(camera.intrinsics, distortion_model="plumb_bob", D=D)
+                pixel = np.stack([u, v], -1).reshape(-1, 1, 2)
+                x, y = cv2.undistortPoints(pixel, K, D, P=K).reshape(*bgr.shape[:2], 2).transpose(2, 0, 1)
+                bgr = np.asarray(cv2.remap(bgr, x.copy(), y.copy(), cv2.INTER_LINEAR), np.uint8)
+            raw = replace(camera.intrinsics, distortion_model="plumb_bob", D=D)
+            stated = raw if stated_raw else replace(camera.intrinsics, raw=raw)
             frame = with_image(result, bgr).frame
             frame = replace(frame, cameras=(replace(frame.cameras[0], intrinsics=stated),))
             faults_now = list(watch.update(frame, frame.clouds, ()))
-    assert [fault.name for fault in faults_now] == ["distortion is corrected twice"] * is_removed
+    assert [fault.name for fault in faults_now] == [name] * bool(name)
 
 
 def restamped(results: Results) -> Results:

@@ -4,7 +4,8 @@ Where the range jumps between neighbouring beams, the image should have an edge 
 edges of single frames are scored at the stated mounting and at small rotations around it. A rotation that
 beats the stated mounting clearly, over several frames, is the error of the transform. The image turned by 180
 degrees and its mirror image are scored too: a driver may turn an image where the transform does not. The same
-holds for the image with its distortion: a driver may have removed it, and still state the coefficients.
+holds for the image with its distortion: a driver may have removed it, and still state the coefficients. An
+image that is said to be rectified may be raw.
 """
 
 from __future__ import annotations
@@ -59,17 +60,20 @@ def _rotations() -> tuple[F64, F64]:
 TURNS, MATRICES = _rotations()
 ROTATIONS = len(TURNS)
 _STATED = np.flatnonzero(np.linalg.norm(TURNS, axis=1) < 1.5 * STEP)
-# Rows of the scores by the code of cv2.flip (None: the image as it is), and of the image with its distortion.
-# These have the rotations at the stated mounting alone. In ``TURNS`` 180 degrees about z are an image upside
-# down, about y a mirror image, and 360 degrees about x an image with its distortion.
+# Rows of the scores by the code of cv2.flip (None: the image as it is), of the image with its distortion, and
+# of one that is raw. These have the rotations at the stated mounting alone. In ``TURNS`` 180 degrees about z
+# are an image upside down, about y a mirror image, 360 degrees about x an image with its distortion, and -360
+# a raw one.
 FLIPS = {
     None: slice(ROTATIONS),
     -1: slice(ROTATIONS, ROTATIONS + len(_STATED)),
     1: slice(ROTATIONS + len(_STATED), ROTATIONS + 2 * len(_STATED)),
 }
-DISTORTED = slice(ROTATIONS + 2 * len(_STATED), None)
-TURNS = np.concatenate([TURNS, *(TURNS[_STATED] + t for t in ([0, 0, 180], [0, 180, 0], [360, 0, 0]))])
-MATRICES = np.concatenate([MATRICES, *[MATRICES[_STATED]] * 3])
+DISTORTED = slice(ROTATIONS + 2 * len(_STATED), ROTATIONS + 3 * len(_STATED))
+RAW = slice(ROTATIONS + 3 * len(_STATED), None)
+_OTHERS = ([0, 0, 180], [0, 180, 0], [360, 0, 0], [-360, 0, 0])
+TURNS = np.concatenate([TURNS, *(TURNS[_STATED] + turn for turn in _OTHERS)])
+MATRICES = np.concatenate([MATRICES, *[MATRICES[_STATED]] * len(_OTHERS)])
 AT_STATED: Bool = np.linalg.norm(TURNS, axis=1) < 1.5 * STEP
 
 
@@ -144,6 +148,12 @@ class PlacementWatch:
                 f": without the coefficients of its CameraInfo it fits LiDAR {lidar}; "
                 "--set source.rectified=yes takes it as it is"
             )
+        elif TURNS[best, 0] < -180:
+            name = "distortion is not corrected"
+            detail = (
+                f": with the coefficients of its CameraInfo it fits LiDAR {lidar}; "
+                "--set source.rectified=no takes it as a raw image"
+            )
         elif TURNS[best, 2] > 90:
             name = "image upside down"
             detail = f": turned by 180 degrees it fits LiDAR {lidar}; turn the image, or roll its transform"
@@ -193,21 +203,27 @@ def score_rotations(camera: Camera, cloud: Cloud, points_from_cloud: F64) -> F64
     every = -(-len(xyz) // EDGES)
     xyz, change = xyz[::every], change[::every]
     scores = np.zeros(len(TURNS))
-    from_camera = (K @ MATRICES).astype(np.float32)
     xyz = geometry.apply(camera_from_cloud, xyz)
     shown = [
-        (image if flip is None else np.asarray(cv2.flip(image, flip), np.uint8), rows)
+        (image if flip is None else np.asarray(cv2.flip(image, flip), np.uint8), K, rows)
         for flip, rows in FLIPS.items()
     ]
+    raw = camera.intrinsics.raw
     if image is not small:
-        shown.append((small, DISTORTED))
-    for picture, rows in shown:
+        shown.append((small, K, DISTORTED))
+    if raw is not None:
+        raw_K = K @ np.linalg.inv(camera.intrinsics.K) @ raw.K
+        raw_view = replace(raw, width=view.width, height=view.height, K=raw_K)
+        shown.append((undistort(small, raw_view), raw_K, RAW))
+    for picture, matrix, rows in shown:
+        from_camera = (matrix @ MATRICES[rows]).astype(np.float32)
         edges = image_edges(picture)
         density, row, _ = densities(change, edges, float(K[0, 0]) * BLUR)
         shift = np.zeros(3, np.float32)
-        add_scores(xyz, row, log_densities(density), from_camera[rows], shift, scores[rows])
-    if image is small:
-        scores[DISTORTED] = scores[_STATED]
+        add_scores(xyz, row, log_densities(density), from_camera, shift, scores[rows])
+    for rows, is_shown in ((DISTORTED, image is not small), (RAW, raw is not None)):
+        if not is_shown:
+            scores[rows] = scores[_STATED]
     return scores
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -76,7 +77,11 @@ def decode_camera_info(msg: Any, rectified: bool, topic: str = "camera_info") ->
         matrix = matrix.copy()
         matrix[:2, 2] -= offset
         matrix /= np.array([[binning[0]], [binning[1]], [1]])
-    return Intrinsics(*size, matrix, model, coefficients, baseline, cropped=cropped, doubt=doubt)
+    raw = None
+    if rectified and np.any(D):
+        with suppress(MessageError):
+            raw = decode_camera_info(msg, rectified=False, topic=topic)
+    return Intrinsics(*size, matrix, model, coefficients, baseline, cropped=cropped, doubt=doubt, raw=raw)
 
 
 def off_centre(matrix: F64, size: tuple[int, int]) -> float:

@@ -67,6 +67,7 @@ class Intrinsics:
     assumed: bool = False  # True: there is no CameraInfo, and these are the configured defaults
     cropped: bool = False  # True: the images show a part of the sensor, so that the centre may be anywhere
     doubt: str = ""  # what of the message does not fit together, as a sentence without the topic
+    raw: Intrinsics | None = None  # model of the images before they were rectified, if that is stated
 
 
 @dataclass(frozen=True, slots=True)

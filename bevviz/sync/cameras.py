@@ -289,7 +289,10 @@ class Cameras:
             return None
         # Pixel (0, 0) is the centre of the corner pixel, so the corner itself is at -0.5.
         scale = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
-        return replace(intrinsics, width=width, height=height, K=scale @ intrinsics.K)
+        raw = intrinsics.raw and replace(
+            intrinsics.raw, width=width, height=height, K=scale @ intrinsics.raw.K
+        )
+        return replace(intrinsics, width=width, height=height, K=scale @ intrinsics.K, raw=raw)
 
 
 def _no_lens(intrinsics: Intrinsics) -> str:
