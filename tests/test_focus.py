@@ -54,15 +54,15 @@ def mark(source: RecordedDrive, overlay: PageOverlay, row: int) -> F32:
 def test_a_click_is_where_the_view_has_gone(source: RecordedDrive, overlay: PageOverlay) -> None:
     """The middle of each view is the subject, and the place before the first answer is as usual."""
     stamp = source.look(FRAME).frame.stamp
-    assert source.position(overlay, stamp, "3D", (0, 0, 0)) == pytest.approx((10, 0, -1))
+    assert overlay.position(stamp, "3D", (0, 0, 0)) == pytest.approx((10, 0, -1))
     place = mark(source, overlay, 0)
     for view in ("3D", FROM_ABOVE):
-        assert source.position(overlay, stamp, view, (0, 0, 0)) == pytest.approx(place, abs=1e-3)
-    assert source.position(overlay, stamp - 10**8, "3D", (0, 0, 0)) == pytest.approx((10, 0, -1))
+        assert overlay.position(stamp, view, (0, 0, 0)) == pytest.approx(place, abs=1e-3)
+    assert overlay.position(stamp - 10**8, "3D", (0, 0, 0)) == pytest.approx((10, 0, -1))
     # The eye looks from the robot's side: behind the middle of the view is farther away.
-    behind = source.position(overlay, stamp, "3D", (10, 0, 0))
+    behind = overlay.position(stamp, "3D", (10, 0, 0))
     assert np.linalg.norm(behind[:2]) > np.linalg.norm(place[:2])
-    ahead = source.position(overlay, stamp, FROM_ABOVE, (10, 0, 0))
+    ahead = overlay.position(stamp, FROM_ABOVE, (10, 0, 0))
     assert ahead == pytest.approx((place[0] + 10, place[1], place[2]), abs=1e-3)
 
 
