@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import bevviz
@@ -26,6 +27,21 @@ def test_labels_of_a_shenzhen_street_are_ground_truth(shared: Path) -> None:
     assert first.boxes.center[0].tolist() == pytest.approx([4.145, -49.720, 1.831], abs=1e-3)
     assert first.boxes.size[0].tolist() == pytest.approx([4.5, 1.679, 1.657], abs=1e-3)
     assert float(first.boxes.yaw[0]) == pytest.approx(1.449, abs=1e-3)
+
+
+def test_labels_numbered_apart_from_their_clouds_are_told(tmp_path: Path) -> None:
+    """Clouds count from 0 and labels from 1, so that all labels but the last are of another cloud."""
+    for folder in ("lidar", "label"):
+        (tmp_path / folder).mkdir()
+    places = {key: {"x": 4, "y": 2, "z": 1} for key in ("position", "scale", "rotation")}
+    for number in range(3):
+        np.save(tmp_path / f"lidar/{number:06d}.npy", np.ones((5, 4), np.float32))
+        label = tmp_path / f"label/{number + 1:06d}.json"
+        label.write_text(json.dumps([{"psr": places, "obj_type": "Car"}]))
+    with bevviz.open(tmp_path) as drive:
+        assert [frame.truth is not None for frame in drive.frames] == [False, True, True]
+        said = f"{tmp_path.name}: label/000003.json: not read: no cloud has this name"
+        assert said in drive.warnings
 
 
 def test_a_label_without_its_class_is_refused_with_its_file(tmp_path: Path) -> None:

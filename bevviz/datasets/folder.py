@@ -178,7 +178,11 @@ class Folder(Dataset):
             read_row = partial(_read_row, files, fields)
             streams.append(cloud_stream(f"/{name}/points", name, times, read_row, files))
             if len(lidars) == 1:
-                streams += truth_streams(self.path, name, files, times)
+                truth = truth_streams(self.path, name, files, times)
+                stems, labels = {file.stem for file in files}, files_in(self.path / LABELS, [".json"])
+                if truth and (lost := [file for file in labels if file.stem not in stems]):
+                    self.warn(f"{self._name_files(lost)}: not read: no cloud has this name")
+                streams += truth
         if not bare and not any(stream.topic == "/ground_truth" for stream in streams):
             self._note_unread_labels({cloud.stem for clouds in lidars.values() for cloud in clouds}, read)
         self.streams = [*mounting_stream(min(stamped.values()), edges), *self._poses(), *streams]
@@ -212,10 +216,9 @@ class Folder(Dataset):
         for folder in folders:
             files = [f for f in files_in(folder, NOTE_SUFFIXES) if scans & {f.stem, Path(f.stem).stem}]
             if files and not set(files) & set(read) and "calib" not in folder.name.lower():
-                more = f" and {len(files) - 1} more" if len(files) > 1 else ""
                 self.warn(
-                    f"{files[0].relative_to(self.path)}{more}, named as the scans, not read: labels of "
-                    f"plain folders are SUSTechPOINTS' in {LABELS}/, else a data set's (docs/inputs.md)"
+                    f"{self._name_files(files)}, named as the scans, not read: labels of plain folders are "
+                    f"SUSTechPOINTS' in {LABELS}/, else a data set's (docs/inputs.md)"
                 )
 
     def _sensors(self, about: Mapping[str, Any]) -> tuple[dict[str, list[Path]], dict[str, list[Path]]]:
