@@ -21,8 +21,7 @@ from bevviz.extras.robot_chain.messages import FollowedObject
 from bevviz.messages.encode import encode_boxes_3d
 from bevviz.model.frame import Boxes3D
 from bevviz.model.results import FrameResult
-from bevviz.workbench.growing_drive import FrameFacts
-from bevviz.workbench.held_seconds import HeldSeconds
+from bevviz.workbench.held_seconds import FrameFacts, HeldSeconds
 from bevviz.workbench.recorded_drive import RecordedDrive
 from tests.support import bags, chained_robot, documented_json
 from tests.support.live_sessions import live_bench
