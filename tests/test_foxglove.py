@@ -8,8 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 
 foxglove = pytest.importorskip("foxglove", reason="needs Foxglove's SDK")
 from foxglove import channels, messages  # noqa: E402
@@ -108,6 +110,40 @@ def test_json_gives_the_same_frames_as_protobuf(tmp_path: Path, mapping: str) ->
             text = MessageToJson(parsed) if mapping == "protobuf" else json.dumps(_times(fields))
             made[channel.topic].log(text.encode(), log_time=message.log_time)
     check(path)
+
+
+@pytest.mark.parametrize("form", ["sqlite3", "ros1"])
+def test_messages_of_foxglove_in_ros_are_read(tmp_path: Path, form: str) -> None:
+    """ROS 1 has matrices in upper case, and no number before the stamp."""
+    made, prefix = bags.Messages(form == "ros1"), "foxglove_msgs/msg/"
+    upper = str.upper if made.ros1 else str
+    start = f"{'time' if made.ros1 else 'builtin_interfaces/Time'} timestamp\nstring frame_id\n"
+    sizes = {"d": 5, "k": 9, "r": 9, "p": 12}
+    matrices = "".join(f"float64[{'' if name == 'd' else n}] {upper(name)}\n" for name, n in sizes.items())
+    for name, text in (
+        ("CompressedImage", "uint8[] data\nstring format\n"),
+        ("CameraCalibration", f"uint32 width\nuint32 height\nstring distortion_model\n{matrices}"),
+    ):
+        made.store.register(get_types_from_msg(start + text, prefix + name))
+    png = np.frombuffer(cv2.imencode(".png", picture(2))[1].tobytes(), np.uint8)
+    numbers = {upper(name): np.zeros(n) for name, n in sizes.items()} | {upper("k"): np.array(K)}
+    items = []
+    for item in bags.small_items(made, scans=3):
+        if item.topic in (bags.IMAGE, bags.INFO):
+            name = "CompressedImage" if item.topic == bags.IMAGE else "CameraCalibration"
+            about = {"timestamp": item.message.header.stamp, "frame_id": bags.CAMERA_FRAME}
+            content: dict[str, Any] = {"data": png, "format": "png"}
+            if item.topic == bags.INFO:
+                content = {"width": 64, "height": 48, "distortion_model": "plumb_bob", **numbers}
+            message = made.make(prefix + name, **about, **content)
+            item = bags.Item(item.topic, prefix + name, item.received, message)
+        items.append(item)
+    with BagSource([bags.write(tmp_path / "drive", items, made, form=form)], load()) as source:
+        for frame in source:
+            (camera,) = frame.cameras
+            assert camera.intrinsics is not None and camera.intrinsics.K.ravel().tolist() == K
+            assert camera.image is not None and camera.image.stamp == frame.stamp
+        assert not source.warnings
 
 
 def test_info_names_kinds_and_roles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

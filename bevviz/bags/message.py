@@ -22,7 +22,7 @@ from bevviz.errors import first_line
 from bevviz.messages import definitions, foxglove
 from bevviz.messages.decoders import MessageError, Scan, read_header
 from bevviz.messages.guard import guard
-from bevviz.support.limits import MAX_DEFINITION, MAX_MESSAGE
+from bevviz.support.limits import MAX_DEFINITION, MAX_MESSAGE, MAX_NAME
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +75,8 @@ class RawMessage:
         if foxglove_encoding(self.connection):
             return guard(self, foxglove.header, self.parsed(data), self.connection.msgtype)
         little = is_ros1(self.connection) or data[1:2] != b"\0"
+        if is_ros1(self.connection) and foxglove.foxglove_type(self.connection.msgtype):
+            data = bytes(4) + data[:MAX_NAME]  # Its stamp has no seq before it.
         return read_header(data, "<" if little else ">", self.topic)
 
     def parsed(self, data: bytes | memoryview) -> Any:

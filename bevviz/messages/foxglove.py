@@ -231,7 +231,8 @@ def _calibration(message: Any) -> Any:
 
 def _matrix_of(message: Any, name: str) -> F64:
     """Return the numbers of a field, which the ROS definition spells in lower case."""
-    return np.array(_first_field(message, name, name.lower()) or [], np.float64)
+    numbers = _first_field(message, name, name.lower())
+    return np.array([] if numbers is None else numbers, np.float64)
 
 
 def _transforms(message: Any) -> list[StampedTransform]:
