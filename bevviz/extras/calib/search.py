@@ -167,7 +167,7 @@ def _grid(shots: Sequence[Shot]) -> tuple[float, list[F64]]:
     roll = np.arange(-ROLLS, ROLLS + 1) * ROLL
     turns = np.stack(np.meshgrid(axis, axis, roll, indexing="ij"), -1)
     rotations = np.stack([error_pose(np.append(turn, np.zeros(4)))[:3, :3] for turn in turns.reshape(-1, 3)])
-    parts = [_shrunk(shot, blur, shrink) for shot in shots]
+    parts = [_shrunk(shot, blur, shrink) for shot in shots if len(shot.xyz)]
     peaks: list[tuple[float, F64]] = []
     for along_x, along_y in itertools.product(SHIFTS, SHIFTS):
         shift = np.array([along_x, along_y, 0.0])

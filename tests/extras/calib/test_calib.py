@@ -324,6 +324,21 @@ def test_the_worst_agreement_of_a_right_calibration(shared: Path) -> None:
     assert best_score(Kitti(shared / "kitti_more", range(12, 16)).frames) > 1.2 * FIT
 
 
+def test_an_image_beside_the_scan_changes_nothing(ten: list[Frame]) -> None:
+    camera = ten[0].cameras[0]
+    assert camera.camera_from_points is not None
+    to_the_sky = np.eye(4)
+    to_the_sky[:3, :3] = geometry.rotations(0, np.array([-np.pi / 2]))[0]
+    upwards = replace(camera, camera_from_points=to_the_sky @ camera.camera_from_points)
+    sky = replace(ten[0], cameras=(upwards,))
+    assert not shots_of([sky]).edges
+    free = np.array([True] * 3 + [False] * 4)
+    alone, beside = (
+        search(shots_of(f).shots, free, lambda done, what: None)[1] for f in ([ten[0]], [ten[0], sky])
+    )
+    np.testing.assert_allclose(beside[0].offsets, alone[0].offsets, atol=1e-6)
+
+
 def best_score(frames: Sequence[Frame]) -> float:
     """Return the mean score of the highest peak."""
     name = frames[0].cameras[0].name
