@@ -233,6 +233,17 @@ def test_several_scans_tell_of_a_small_tilt(scan: Cloud, real: float, stated: fl
     assert f"with a further roll of 0 and pitch of {real - stated} degrees" in text
 
 
+@pytest.mark.parametrize(("divisor", "unit"), [(1, ""), (100, "centimetres"), (1000, "millimetres")])
+def test_the_unit_of_a_transform_is_told_by_the_ground(scan: Cloud, divisor: int, unit: str) -> None:
+    mounting = np.eye(4)
+    mounting[2, 3] = 1.8 * divisor
+    _, sync = built(scan, np.eye(4), lambda sync, _: by_base(sync, mounting))
+    told = [text for text in sync.report.warnings() if "ground" in text]
+    assert [f"is in {unit}; divide the translation by {divisor} " in text for text in told] == [True] * bool(
+        unit
+    )
+
+
 def test_an_unknown_mounting_is_assumed_and_reported() -> None:
     points = np.random.default_rng(0).normal(size=(2000, 3)).astype(np.float32) * 5
     sync = Synchronizer(ROLES, CONFIG)

@@ -32,6 +32,8 @@ LEVEL, LEVEL_SCANS, LEVEL_TIME = math.radians(5.0), 4, 1.0
 ALIKE = math.radians(
     3.0
 )  # between these scans: more means that the robot swings, or that the ground is rough
+# Metres above the robot that no LiDAR is, and the units that such a transform may be in.
+TALL, UNITS = 10.0, {100: "centimetres", 1000: "millimetres"}
 GRAVITY_TIME = 2.0  # seconds of smoothing: braking is no slope
 # Metres from the LiDAR, points and planes of the search for the ground.
 NEAR, POINTS, PLANES = 25.0, 4000, 400
@@ -121,6 +123,8 @@ class VerticalEstimate:
             )
         elif base is not None and self.checked is None:
             self._compare(cloud, frame, base)
+        if base is not None and ground is not None:
+            self._check_unit(cloud, frame, ground)
         if _angle(up, _Z) > (TILT if base is not None else SLOPE):
             self._tilted.add(frame)
         if frame not in self._tilted:
@@ -144,6 +148,20 @@ class VerticalEstimate:
             f"'{self.base_frame}', in {len(ups)} scans: its transform is wrong, and would fit with a further "
             f"roll of {roll} and pitch of {-pitch} degrees (source.extrinsics states transforms)"
         )
+
+    def _check_unit(self, cloud: Cloud, frame: str, ground: F64) -> None:
+        """Compare the stated height of a LiDAR on the robot with its height above the ground."""
+        stated = abs(float(self.tf.lookup(self.base_frame, frame, cloud.stamp, self.tolerance).matrix[2, 3]))
+        if stated < TALL:
+            return
+        height = abs(float(np.quantile(cloud.xyz @ ground, 0.05)))
+        divisor = 10 ** round(math.log10(stated / max(height, 0.01)))
+        if divisor in UNITS:
+            self.warnings[frame] = (
+                f"LiDAR frame '{frame}' is {stated:.0f} m from '{self.base_frame}' in height, and "
+                f"{height:.1f} m above the ground: its transform is in {UNITS[divisor]}; divide the "
+                f"translation by {divisor} (source.extrinsics states transforms)"
+            )
 
     def _up(self, cloud: Cloud, frame: str, fixed_frame: str) -> tuple[F64 | None, str]:
         """Return up in a LiDAR's frame, by the fixed frame or by gravity, and the name of the source."""
