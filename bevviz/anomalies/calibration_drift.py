@@ -20,7 +20,7 @@ import numpy as np
 
 from bevviz.anomalies.sensor_faults import SensorFault
 from bevviz.model import geometry
-from bevviz.model.frame import F32, F64, Bool, Camera, Cloud, Frame, Intrinsics
+from bevviz.model.frame import F32, F64, I64, U8, Bool, Camera, Cloud, Frame, Intrinsics
 from bevviz.stages.edges import (
     add_scores,
     cloud_edges,
@@ -57,24 +57,47 @@ def _rotations() -> tuple[F64, F64]:
     return turns, np.stack([cv2.Rodrigues(np.radians(turn))[0] for turn in turns])
 
 
+@dataclass(frozen=True, slots=True)
+class _Variant:
+    """Image that the camera may have sent in place of the stated one, and the fault that it would be.
+
+    Attributes:
+        fault: name of the fault.
+        detail: how the fault is known and mended.
+    """
+
+    fault: str
+    detail: str
+
+
+VARIANTS = (
+    _Variant(
+        "image upside down",
+        "turned by 180 degrees it fits LiDAR {lidar}; turn the image, or roll its transform",
+    ),
+    _Variant(
+        "mirrored image",
+        "flipped left to right it fits LiDAR {lidar}; flip the image, or the y of the points",
+    ),
+    _Variant(
+        "distortion is corrected twice",
+        "without the coefficients of its CameraInfo it fits LiDAR {lidar}; "
+        "--set source.rectified=yes takes it as it is",
+    ),
+    _Variant(
+        "distortion is not corrected",
+        "with the coefficients of its CameraInfo it fits LiDAR {lidar}; "
+        "--set source.rectified=no takes it as a raw image",
+    ),
+)
 TURNS, MATRICES = _rotations()
 ROTATIONS = len(TURNS)
-_STATED = np.flatnonzero(np.linalg.norm(TURNS, axis=1) < 1.5 * STEP)
-# Rows of the scores by the code of cv2.flip (None: the image as it is), of the image with its distortion, and
-# of one that is raw. These have the rotations at the stated mounting alone. In ``TURNS`` 180 degrees about z
-# are an image upside down, about y a mirror image, 360 degrees about x an image with its distortion, and -360
-# a raw one.
-FLIPS = {
-    None: slice(ROTATIONS),
-    -1: slice(ROTATIONS, ROTATIONS + len(_STATED)),
-    1: slice(ROTATIONS + len(_STATED), ROTATIONS + 2 * len(_STATED)),
-}
-DISTORTED = slice(ROTATIONS + 2 * len(_STATED), ROTATIONS + 3 * len(_STATED))
-RAW = slice(ROTATIONS + 3 * len(_STATED), None)
-_OTHERS = ([0, 0, 180], [0, 180, 0], [360, 0, 0], [-360, 0, 0])
-TURNS = np.concatenate([TURNS, *(TURNS[_STATED] + turn for turn in _OTHERS)])
-MATRICES = np.concatenate([MATRICES, *[MATRICES[_STATED]] * len(_OTHERS)])
-AT_STATED: Bool = np.linalg.norm(TURNS, axis=1) < 1.5 * STEP
+STATED = np.flatnonzero(np.linalg.norm(TURNS, axis=1) < 1.5 * STEP)  # rotations at the stated mounting
+# A row of the scores is a rotation of the stated image, or one at the stated mounting of a variant.
+_SIZES = [ROTATIONS, *[len(STATED)] * len(VARIANTS)]
+ROWS = [slice(int(end) - size, int(end)) for size, end in zip(_SIZES, np.cumsum(_SIZES), strict=True)]
+ROTATION: I64 = np.concatenate([np.arange(ROTATIONS), *[STATED] * len(VARIANTS)])  # of each row
+IMAGE: I64 = np.repeat(np.arange(len(_SIZES)), _SIZES)  # of each row; 0: the stated one
 
 
 @dataclass(slots=True)
@@ -139,46 +162,32 @@ class PlacementWatch:
             pair.fault = None
             return
         since = pair.stamps[0] if pair.fault is None else pair.fault.since
-        if best < ROTATIONS:
-            name = "not where its transform says"
+        if IMAGE[best] == 0:
+            fault = "not where its transform says"
             detail = f", by about {np.linalg.norm(TURNS[best]):.0f} degrees against LiDAR {lidar}"
-        elif TURNS[best, 0] > 180:
-            name = "distortion is corrected twice"
-            detail = (
-                f": without the coefficients of its CameraInfo it fits LiDAR {lidar}; "
-                "--set source.rectified=yes takes it as it is"
-            )
-        elif TURNS[best, 0] < -180:
-            name = "distortion is not corrected"
-            detail = (
-                f": with the coefficients of its CameraInfo it fits LiDAR {lidar}; "
-                "--set source.rectified=no takes it as a raw image"
-            )
-        elif TURNS[best, 2] > 90:
-            name = "image upside down"
-            detail = f": turned by 180 degrees it fits LiDAR {lidar}; turn the image, or roll its transform"
         else:
-            name = "mirrored image"
-            detail = f": flipped left to right it fits LiDAR {lidar}; flip the image, or the y of the points"
-        pair.fault = SensorFault(f"camera {camera}", name, since, detail)
+            variant = VARIANTS[IMAGE[best] - 1]
+            fault, detail = variant.fault, ": " + variant.detail.format(lidar=lidar)
+        pair.fault = SensorFault(f"camera {camera}", fault, since, detail)
 
 
 def find_error(scores: F64) -> int | None:
-    """Return the row of ``TURNS`` that corrects the stated mounting. None: it is right, or nobody can tell.
+    """Return the row of the scores that corrects the stated one. None: it is right, or nobody can tell.
 
     Args:
-        scores: (C, R) score of each row of ``TURNS`` in each check.
+        scores: (C, R) score of each rotation and of each variant of the image, in each check.
     """
     if len(scores) < LEAST_PAST:
         return None
     total = scores.sum(axis=0)
     best, spread = int(total.argmax()), float(total[:ROTATIONS].std())
-    apart = np.linalg.norm(TURNS - TURNS[best], axis=1)
-    stated = scores[:, AT_STATED].max(axis=1)
+    turns = TURNS[ROTATION]
+    apart = np.where(IMAGE[best] == IMAGE, np.linalg.norm(turns - turns[best], axis=1), np.inf)
+    stated = scores[:, STATED].max(axis=1)
     better = scores[:, apart < STEP + 0.1].max(axis=1) > stated
     if (
-        np.linalg.norm(TURNS[best]) < LEAST
-        or total[best] - total[AT_STATED].max() < CLEAR * spread
+        (IMAGE[best] == 0 and np.linalg.norm(turns[best]) < LEAST)
+        or total[best] - total[STATED].max() < CLEAR * spread
         or total[best] - total[apart > LEAST].max() < UNIQUE * spread
         or better.mean() < MOST
     ):
@@ -187,7 +196,7 @@ def find_error(scores: F64) -> int | None:
 
 
 def score_rotations(camera: Camera, cloud: Cloud, points_from_cloud: F64) -> F64 | None:
-    """Return the (R,) scores of all rotations in one frame. None: too few edges, or nothing to compare."""
+    """Return the (R,) scores of one frame. None: too few edges, or nothing to compare."""
     if camera.image is None or camera.intrinsics is None or camera.camera_from_points is None:
         return None
     small, K = shrink(cv2.cvtColor(camera.image.bgr, cv2.COLOR_BGR2GRAY), camera.intrinsics.K, PIXELS)
@@ -202,28 +211,28 @@ def score_rotations(camera: Camera, cloud: Cloud, points_from_cloud: F64) -> F64
         return None
     every = -(-len(xyz) // EDGES)
     xyz, change = xyz[::every], change[::every]
-    scores = np.zeros(len(TURNS))
     xyz = geometry.apply(camera_from_cloud, xyz)
-    shown = [
-        (image if flip is None else np.asarray(cv2.flip(image, flip), np.uint8), K, rows)
-        for flip, rows in FLIPS.items()
-    ]
+    # The stated image, and its variants in their order. None: the same as the stated one.
+    images: list[tuple[U8, F64] | None] = [(image, K)]
+    images += [(np.asarray(cv2.flip(image, code), np.uint8), K) for code in (-1, 1)]
+    images.append(None if image is small else (small, K))
     raw = camera.intrinsics.raw
-    if image is not small:
-        shown.append((small, K, DISTORTED))
-    if raw is not None:
+    if raw is None:
+        images.append(None)
+    else:
         raw_K = K @ np.linalg.inv(camera.intrinsics.K) @ raw.K
         raw_view = replace(raw, width=view.width, height=view.height, K=raw_K)
-        shown.append((undistort(small, raw_view), raw_K, RAW))
-    for picture, matrix, rows in shown:
-        from_camera = (matrix @ MATRICES[rows]).astype(np.float32)
-        edges = image_edges(picture)
+        images.append((undistort(small, raw_view), raw_K))
+    scores = np.zeros(len(ROTATION))
+    for shown, rows in zip(images, ROWS, strict=True):
+        if shown is None:
+            scores[rows] = scores[STATED]
+            continue
+        from_camera = (shown[1] @ MATRICES[ROTATION[rows]]).astype(np.float32)
+        edges = image_edges(shown[0])
         density, row, _ = densities(change, edges, float(K[0, 0]) * BLUR)
         shift = np.zeros(3, np.float32)
         add_scores(xyz, row, log_densities(density), from_camera, shift, scores[rows])
-    for rows, is_shown in ((DISTORTED, image is not small), (RAW, raw is not None)):
-        if not is_shown:
-            scores[rows] = scores[_STATED]
     return scores
 
 
