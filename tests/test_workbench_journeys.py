@@ -504,8 +504,8 @@ def test_the_drive_is_run_with_other_values(page: Page) -> None:
         until(lambda: f"eps={value}" in page.inner_text("#trial-set"))  # noqa: B023
         until(lambda: page.locator("#drive-cancel").is_hidden())
         assert page.inner_text("#trial-text").startswith("F1 ")
-    until(lambda: page.locator("#runs button").count() == 2)
-    page.locator("#runs button", has_text="0.3").click()
+    until(lambda: page.locator("#runs button").count() >= 2)  # Another test may have run a span.
+    page.locator("#runs button", has_text="0.3").last.click()
     until(lambda: state(page).get("set") == ["clustering.eps=0.3"])
     until(lambda: "eps=0.3" in page.inner_text("#trial-set"))
     assert "differences of clustering.eps=0.9" in page.inner_text("#trial-listed")
