@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 
 from bevviz.checks.read_input import ReadInput
-from bevviz.datasets.result_files import RESULTS
 from bevviz.model.box_points import inside_each
 from bevviz.model.frame import F64, Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.input_findings import InputFinding, Remedy
@@ -64,6 +63,8 @@ def count_labels(labels: dict[str, Counter[str]], frame: Frame) -> None:
     if frame.truth is not None:
         _count_boxes(labels[TRUTH], frame, frame.truth)
     for boxes in frame.robot_boxes:
+        from bevviz.datasets.result_files import RESULTS  # A bag needs no loader of data sets.
+
         if boxes.topic.startswith(RESULTS):
             _count_boxes(labels[boxes.topic], frame, boxes)
 
