@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from bevviz.cli import main, workbench
 from bevviz.support import cleanup
 from tests.support.commands import environment
+from tests.support.kept_drives import BAG
 from tests.support.waiting import PATIENCE
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -99,6 +103,17 @@ def test_an_ignored_signal_stays_ignored(tmp_path: Path, number: signal.Signals)
         f"os.kill(os.getpid(), {number}); print(ended.is_set())\n"
     )
     assert python(script, tmp_path).stdout == "False\n"
+
+
+def test_a_page_ends_if_the_exception_of_a_signal_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python loses one that is raised in a destructor."""
+
+    def announce(*_: object) -> None:
+        with suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(workbench, "announce", announce)
+    assert main(["open", str(BAG)]) == 0
 
 
 def test_deleted_files_are_no_longer_tracked() -> None:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from bevviz.workbench.session import WorkbenchSession
 
 EMPTY: Mapping[str, str] = MappingProxyType({})
+LOOK = 0.5  # seconds between two looks whether the user ends the page
 EXAMPLES = """examples:
   bevviz drive.mcap                                     the same as bevviz open drive.mcap
   bevviz open drive.mcap --model yolo11n.onnx           a page: click what you see, and it answers
@@ -120,11 +121,12 @@ def open_page(
         def ready(address: str) -> None:
             announce("workbench", f"{address}#{urlencode(shown)}" if shown else address, page.browser)
 
-        with suppress(KeyboardInterrupt), interruptible():  # The user ends it with a signal.
+        with suppress(KeyboardInterrupt), interruptible() as ended:  # The user ends it with a signal.
             drive = "\n".join(str(beside(path)) for path in paths)
             return_freed_memory()
             with page_server(make, "page", page.port, ready, drive) as server:
-                server.join()
+                while server.is_alive() and not ended.is_set():  # The exception of the signal may get lost.
+                    server.join(LOOK)
     return 0
 
 
