@@ -76,7 +76,8 @@ def detections(frame: Frame, *settings: str, model: str = "demo", stored: bool =
 def test_a_robots_images_leave_nothing_in_the_store(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     networks: list[object] = []
 
-    def run(settings: ReloadableConfig, _: object, __: object, loader: StageLoader, ___: object) -> int:
+    def run(settings: ReloadableConfig, *others: object) -> int:
+        (loader,) = [other for other in others if isinstance(other, StageLoader)]
         networks.append(loader.load(settings.config).network)
         return 0
 
