@@ -15,7 +15,7 @@ import bevviz
 from bevviz.anomalies import AnomalyDetector
 from bevviz.anomalies.calibration_drift import LEAST_PAST, PlacementWatch, find_error, score_rotations
 from bevviz.anomalies.mounting_changes import MountingWatch
-from bevviz.anomalies.sensor_faults import ImageWatch
+from bevviz.anomalies.sensor_faults import ImageWatch, RegionWatch
 from bevviz.anomalies.sensors import SensorWatch
 from bevviz.config import AnomaliesConfig
 from bevviz.model.frame import Camera, Image, Intrinsics
@@ -117,6 +117,17 @@ def test_images_are_late_after_a_missing_one(drive: Results) -> None:
     assert row == FIRST + 1 and anomaly.text.endswith(
         "an image is missing, and those after it may be late by one"
     )
+
+
+def test_a_camera_that_swings_is_not_covered(drive: Results) -> None:
+    """It looks at the sky once in 1.7 s; before that it has not seen all that is usual."""
+    watch = RegionWatch(CAMERA)
+    for row, result in enumerate(drive):
+        image = pixels(result)
+        room = np.array(image.shape[:2]) - (250, 400)
+        top, left = (room / 2 * (1 + np.sin(np.array([3.7, 2.7]) * row / 10))).astype(int)
+        gray = cv2.cvtColor(image[top : top + 250, left : left + 400], cv2.COLOR_BGR2GRAY)
+        assert list(watch.update(row * 100_000_000, np.asarray(gray, np.uint8))) == []
 
 
 def test_a_cover_is_named_with_its_place(drive: Results) -> None:

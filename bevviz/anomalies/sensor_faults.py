@@ -46,6 +46,8 @@ TWO_STEPS = 1.2  # least ratio of the change over two images to that over one: a
 REGIONS = (9, 12)  # rows and columns of the regions in which fine details are compared
 DETAIL = 5  # pixels; finer details are compared. Defocus and covers lose them, and brightness keeps them
 DETAIL_LEFT = 0.35  # ratio of the usual details of a region below which something covers or blurs it
+FEWEST = 0.05  # quantile of the details of a region that are usual; a camera that swings sees sky at times
+LEAST_SEEN = 8  # images; the details of fewer are not the usual ones
 LEAST_DETAIL = 2.0  # grey values, usual details of a region that can be judged
 COVERED = 0.1  # least share of the judged regions that fall together
 DEFOCUSED = 0.85  # the same where the lens is out of focus, and nothing covers it
@@ -242,8 +244,8 @@ class RegionWatch:
         """Yield regions of the newest image that lost their details at one time. Objects come bit by bit."""
         details = _details(gray)
         self._stamps.append(stamp)
-        if len(self._past) >= LEAST_PAST:
-            self._usual = np.where(self._low > 0, self._usual, np.median(self._past, axis=0))
+        if len(self._past) >= LEAST_SEEN:
+            self._usual = np.where(self._low > 0, self._usual, np.quantile(self._past, FEWEST, axis=0))
             is_low = (self._usual >= LEAST_DETAIL) & (details < DETAIL_LEFT * self._usual)
             self._low = np.where(is_low & (self._low < FORGOTTEN), self._low + 1, 0)
         self._past.append(np.where(self._low > 0, self._usual, details))
