@@ -10,7 +10,7 @@ from itertools import takewhile
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import PlainSerializer
+from pydantic import BeforeValidator, PlainSerializer
 from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from bevviz.findings.frame_findings import KINDS, Finding, Position
@@ -55,6 +55,11 @@ def _page_distance(distance: float) -> float | None:
     return None if math.isnan(distance) else round(distance, 1)
 
 
+def _known_distance(distance: float | None) -> float:
+    """Return a distance of a message of the page. NaN: it is unknown."""
+    return math.nan if distance is None else distance
+
+
 @message_form
 @dataclass(frozen=True, slots=True)
 class FindingFrame:
@@ -75,7 +80,9 @@ class FindingFrame:
 
     frame: int
     stamp: Annotated[int, PlainSerializer(str, return_type=str)]
-    distance: Annotated[float, PlainSerializer(_page_distance, return_type=float | None)]
+    distance: Annotated[
+        float, PlainSerializer(_page_distance, return_type=float | None), BeforeValidator(_known_distance)
+    ]
     pick: str
     tried: bool = False
     text: str = ""
