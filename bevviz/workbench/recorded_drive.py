@@ -92,7 +92,8 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
 
     def start(self) -> None:
         """Start the run: record the frame that is shown first, then all frames in order."""
-        self._runs.start(self._job, self._run)
+        is_known = self._load_list()
+        self._runs.start(self._job, lambda job: self._run(job, is_known))
 
     def close(self) -> None:
         """Stop the run, then close the buffers and both sources."""
@@ -139,8 +140,7 @@ class RecordedDrive(GrowingDrive, Observer[FrameResult]):
             "warnings": list(self.again.warnings) if self.over else [],
         }
 
-    def _run(self, job: Job) -> None:
-        is_known = self._load_list()
+    def _run(self, job: Job, is_known: bool) -> None:
         first = self.look(self._first)
         self.first = self._stamp_of(0)
         explainer = self.explainer(first)
