@@ -19,7 +19,11 @@ def synthetic(path: Path, frames: int, seed: int, *, truth: bool) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("truth", "kinds"), [(True, {"missed"}), (False, {"unmatched", "unnamed"})], ids=["truth", "without"]
+    ("truth", "kinds"),
+    [
+        pytest.param(True, {"missed"}, id="truth"),
+        pytest.param(False, {"unmatched", "unnamed"}, id="without", marks=pytest.mark.long),
+    ],
 )
 def test_all_places_count_the_same(truth: bool, kinds: set[str], tmp_path: Path) -> None:
     drive = synthetic(tmp_path / "drive.mcap", 3, 5, truth=truth)
