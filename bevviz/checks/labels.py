@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from bevviz.checks.read_input import ReadInput
+from bevviz.messages.topics import RESULT_TOPICS
 from bevviz.model.box_points import inside_each
 from bevviz.model.frame import F64, Boxes3D, Frame, LabelledBoxes3D
 from bevviz.model.input_findings import InputFinding, Remedy
@@ -63,9 +64,7 @@ def count_labels(labels: dict[str, Counter[str]], frame: Frame) -> None:
     if frame.truth is not None:
         _count_boxes(labels[TRUTH], frame, frame.truth)
     for boxes in frame.robot_boxes:
-        from bevviz.datasets.result_files import RESULTS  # A bag needs no loader of data sets.
-
-        if boxes.topic.startswith(RESULTS):
+        if boxes.topic.startswith(RESULT_TOPICS):
             _count_boxes(labels[boxes.topic], frame, boxes)
 
 

@@ -285,7 +285,8 @@ def result_settings(
     """
     if not results:
         return []
-    from bevviz.datasets.result_files import RESULTS, results_are_2d
+    from bevviz.datasets.result_files import results_are_2d
+    from bevviz.messages.topics import RESULT_TOPICS
 
     named = dict[str, str]()
     for text in results:
@@ -298,7 +299,7 @@ def result_settings(
     stages = dict[str, str]()
     for name, path in named.items():
         key = "detector.model" if results_are_2d(Path(path).expanduser()) else "objects.method"
-        stages.setdefault(key, f"topic:{RESULTS}{name}")
+        stages.setdefault(key, f"topic:{RESULT_TOPICS}{name}")
     stated = {text.partition("=")[0] for text in settings} | {key for key, value in options.items() if value}
     chosen = [f"{key}={value}" for key, value in stages.items() if key not in stated]
     return [f"source.results={json.dumps(named)}", *chosen]

@@ -18,7 +18,7 @@ from bevviz.datasets.dataset import NOT_AS_DOCUMENTED, describe_error, files_in
 from bevviz.datasets.kitti_labels import TURN, Calibration, labelled_boxes
 from bevviz.errors import UserError, first_line
 from bevviz.messages.foreign_boxes import BoxRow, box_columns, boxes_2d, boxes_3d
-from bevviz.messages.topics import Topic
+from bevviz.messages.topics import RESULT_TOPICS, Topic
 from bevviz.model import geometry
 from bevviz.model.class_names import NUSCENES_CLASSES
 from bevviz.model.frame import F64, Frame, LabelledBoxes2D, LabelledBoxes3D
@@ -26,7 +26,6 @@ from bevviz.stages.detector.names import COCO_CATEGORIES
 from bevviz.support.files import read_text
 from bevviz.support.limits import JSON_LIMIT, TABLE_LIMIT
 
-RESULTS = "/results/"  # topics of result files begin with it
 BOXES_3D, BOXES_2D = "vision_msgs/msg/Detection3DArray", "vision_msgs/msg/Detection2DArray"
 NUMBER = re.compile(r"(\d+)\D*$")
 ROBOFLOW = re.compile(r"_[A-Za-z]+\.rf\.\w+$")  # frame_000012_png.rf.0a1b2c, as Roboflow names copies
@@ -56,7 +55,7 @@ class ResultFile(ABC):
     is_2d = False
 
     def __init__(self, name: str, path: Path) -> None:
-        self.topic, self.path = RESULTS + name, path
+        self.topic, self.path = RESULT_TOPICS + name, path
         self.numbers: Collection[int] = ()
         self.frames: Sequence[int] = ()
 

@@ -15,6 +15,7 @@ from bevviz.messages.foreign_boxes import holds_boxes
 
 CLOUDS = ("PointCloud2", "LaserScan")  # what may be a LiDAR's; scans of one plane where there is no cloud
 IMAGES = ("Image", "CompressedImage", "CompressedVideo")
+RESULT_TOPICS = "/results/"  # topics of result files begin with it
 VIDEO = "video of a kind that is not decoded here: republish it as images (image_transport) and record these"
 
 # Entities of recordings beside those of the sensors (docs/reference.md). No sensor may have these names.
