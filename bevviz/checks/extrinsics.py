@@ -19,6 +19,7 @@ from bevviz.checks.read_input import CameraSample, ReadInput
 from bevviz.model import geometry
 from bevviz.model.frame import F64
 from bevviz.model.input_findings import InputFinding, Remedy
+from bevviz.sync.gravity import SMALL_UNITS
 
 LEVEL = math.radians(60.0)  # largest tilt of an image's down axis from the vertical without a doubt
 UPRIGHT = math.radians(35.0)  # the same of a pose that is proposed
@@ -30,7 +31,7 @@ POOR, GOOD, CLEAR = (
     0.8,
 )  # shares with points: of a wrong pose, a better and a right one
 FAR = 10.0  # metres from the LiDAR, from which on a camera is not on the same robot
-UNITS = {1000: "millimetres", 100: "centimetres", 10: "decimetres"}  # divisors that make metres of a unit
+UNITS = {**SMALL_UNITS, 10: "decimetres"}  # divisors that make metres of a unit
 NEAR = 3.0  # metres; a camera is mostly nearer to the LiDAR
 USUAL = 0.3  # metres between a camera and a LiDAR
 

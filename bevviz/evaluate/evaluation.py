@@ -104,9 +104,8 @@ class Evaluation(Observer[FrameResult], Tabular):
         self._tracks = TrackScore()
         self._detections = ObjectScore(self.score.accepted)
         self._ground: Counter[str] = Counter()
-        self._misnamed: Counter[tuple[str, str]] = (
-            Counter()
-        )  # missed labels by label and name of the object there
+        # Missed labels by label and name of the object there.
+        self._misnamed: Counter[tuple[str, str]] = Counter()
         self._metrics: dict[str, float] | None = None
 
     def observe(self, result: FrameResult) -> None:

@@ -29,11 +29,9 @@ SLOPE = math.radians(8.0)  # the same without a transform to the robot: a road m
 DISAGREEMENT = math.radians(12.0)  # between transforms and ground; more means that one of them is wrong
 # The same for the mounting on the robot, by several scans: radians, scans, and seconds between two of them.
 LEVEL, LEVEL_SCANS, LEVEL_TIME = math.radians(5.0), 4, 1.0
-ALIKE = math.radians(
-    3.0
-)  # between these scans: more means that the robot swings, or that the ground is rough
+ALIKE = math.radians(3.0)  # between these scans; more means that the robot swings, or rough ground
 # Metres above the robot that no LiDAR is, and the units that such a transform may be in.
-TALL, UNITS = 10.0, {100: "centimetres", 1000: "millimetres"}
+TALL, SMALL_UNITS = 10.0, {100: "centimetres", 1000: "millimetres"}
 GRAVITY_TIME = 2.0  # seconds of smoothing: braking is no slope
 # Metres from the LiDAR, points and planes of the search for the ground.
 NEAR, POINTS, PLANES = 25.0, 4000, 400
@@ -156,10 +154,10 @@ class VerticalEstimate:
             return
         height = abs(float(np.quantile(cloud.xyz @ ground, 0.05)))
         divisor = 10 ** round(math.log10(stated / max(height, 0.01)))
-        if divisor in UNITS:
+        if divisor in SMALL_UNITS:
             self.warnings[frame] = (
                 f"LiDAR frame '{frame}' is {stated:.0f} m from '{self.base_frame}' in height, and "
-                f"{height:.1f} m above the ground: its transform is in {UNITS[divisor]}; divide the "
+                f"{height:.1f} m above the ground: its transform is in {SMALL_UNITS[divisor]}; divide the "
                 f"translation by {divisor} (source.extrinsics states transforms)"
             )
 
