@@ -89,7 +89,7 @@ def test_a_clouds_own_pose_is_applied(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mapping", ["foxglove", "protobuf"])
 def test_json_gives_the_same_frames_as_protobuf(tmp_path: Path, mapping: str) -> None:
-    """What the SDK wrote as protobuf, as JSON by Foxglove's schemas and as protobuf's own JSON."""
+    """Write the protobuf messages of the SDK again as JSON, in Foxglove's mapping and in protobuf's own."""
     from google.protobuf.json_format import MessageToDict, MessageToJson
     from mcap.reader import make_reader
 
